@@ -1,0 +1,106 @@
+"""What the analyses return: one set of objects that tables, `--json`, Rerun views and reports all print from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.flight import Flight
+
+
+@dataclass(frozen=True)
+class AxisError:
+    """Model error on one axis of the heading frame ("x", "y", "z"), m/s²; `share_explained` of the linear model's
+    squared error above the noise floor, 0 to 1."""
+
+    axis: str
+    rms: float
+    noise_floor: float
+    share_explained: float
+
+
+@dataclass(frozen=True)
+class HorizonError:
+    """Open-loop prediction error after `horizon` s: RMS over restarts, per world axis."""
+
+    horizon: float
+    position: tuple[float, float, float]  # m
+    velocity: tuple[float, float, float]  # m/s
+    restarts: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One model against one flight.
+
+    All arrays have the flight's N rows. `measured` and `predicted` (N, 3) are accelerations in m/s², heading frame,
+    both through the same low-pass of `bandwidth` Hz; `residual` is measured minus predicted; `used` (N,) bool marks
+    the samples that count (flying, not saturated, finite).
+    """
+
+    flight: Flight
+    label: str  # name of the model version, as shown to people
+    measured: np.ndarray
+    predicted: np.ndarray
+    residual: np.ndarray
+    used: np.ndarray
+    bandwidth: float
+    axes: tuple[AxisError, ...]
+    horizons: tuple[HorizonError, ...]
+    rms: float  # over all axes
+    noise_floor: float
+
+
+@dataclass(frozen=True)
+class ErrorMap:
+    """Squared residual against one variable, in bins: `edges` (B+1,), the others (B,)."""
+
+    variable: str  # "height", "speed", "tilt", "thrust", "voltage", "time", ...
+    unit: str
+    edges: np.ndarray
+    rms: np.ndarray  # m/s², nan where a bin is empty
+    share_of_error: np.ndarray  # of the sum of squares, 0 to 1
+    share_of_time: np.ndarray
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of the flight that holds more than its share of the squared error."""
+
+    text: str  # "71 % of the squared error sits below 0.4 m, in 12 % of the flight"
+    variable: str
+    low: float
+    high: float
+    share_of_error: float
+    share_of_time: float
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One of the worst stretches of a flight, s on the flight's clock; rms in m/s²."""
+
+    start: float
+    end: float
+    rms: float
+    text: str
+
+
+@dataclass(frozen=True)
+class WhereItFails:
+    """Where the residual of a comparison sits."""
+
+    maps: tuple[ErrorMap, ...]
+    regions: tuple[Region, ...]
+    worst: tuple[Moment, ...]
+    place: ErrorMap | None = None  # over horizontal distance cells; None where the flight has no position
+
+
+@dataclass(frozen=True)
+class WaterfallStep:
+    """The residual RMS (m/s²) of one model version on the fitted and on the held-out flight."""
+
+    label: str
+    fitted: float
+    held_out: float | None
+    noise_floor: float

@@ -1,0 +1,65 @@
+"""The contract of a deployed model: one ONNX file with metadata, and the keys and payloads on Zenoh."""
+
+from __future__ import annotations
+
+import hashlib
+
+CONTRACT_VERSION = "1"
+
+INPUT_NAME, OUTPUT_NAME = "features", "delta"
+"""float32 [N, F] in, float32 [N, 3] out: error acceleration in m/s², heading frame."""
+
+FEATURES: dict[str, str] = {
+    "z": "m",
+    "cos_phi": "1",
+    "sin_phi": "1",
+    "cos_theta": "1",
+    "sin_theta": "1",
+    "vx": "m/s",
+    "vy": "m/s",
+    "vz": "m/s",
+    "u_batt": "V",
+    "T": "N",
+}
+"""Features (28) of the paper in their order, with units. `vx, vy` in the heading frame, `z` above ground."""
+
+YAW_FEATURES: dict[str, str] = {"cos_psi": "1", "sin_psi": "1"}
+"""Appended for a model that needs yaw (wind)."""
+
+# Keys of the ONNX file's custom metadata; every value is a string, lists and objects as JSON.
+KEY_CONTRACT = "trueflight.contract"  # CONTRACT_VERSION
+KEY_NAME = "name"
+KEY_VERSION = "version"
+KEY_VEHICLE = "vehicle"  # {"name": str, "mass": kg, "hover_thrust": 1}
+KEY_FEATURES = "features"  # [{"name", "unit", "low", "high"}], the range seen in training
+KEY_CHAIN = "chain"  # [{"effect": name, "parameters": {name: value}}], in order
+KEY_DATA_HASH = "data_hash"
+KEY_GOLDEN_FEATURES = "golden_features"  # [[F floats] x at least 3]
+KEY_GOLDEN_DELTA = "golden_delta"  # [[3 floats] x as many]; the companion evaluates them again, within GOLDEN_TOLERANCE
+REQUIRED_KEYS = (
+    KEY_CONTRACT,
+    KEY_NAME,
+    KEY_VERSION,
+    KEY_VEHICLE,
+    KEY_FEATURES,
+    KEY_CHAIN,
+    KEY_DATA_HASH,
+    KEY_GOLDEN_FEATURES,
+    KEY_GOLDEN_DELTA,
+)
+GOLDEN_TOLERANCE = 1e-3  # m/s², absolute
+
+
+def model_hash(onnx: bytes) -> str:
+    """Name of a model by its content: the first 12 hexadecimal digits of the file's SHA-256."""
+    return hashlib.sha256(onnx).hexdigest()[:12]
+
+
+def key(vehicle: str, leaf: str) -> str:
+    """Zenoh key `trueflight/<vehicle>/<leaf>`.
+
+    Leaves: `tick` (protobuf Tick), `event` (protobuf Event), `status` (liveliness token, and a query answered with
+    JSON), `mission` (query with JSON), `model` (query, ONNX bytes as payload), `record` (query; JSON list, or the
+    bytes of one record). Queries are answered with JSON `{"accepted": bool, "reason": str, ...}`.
+    """
+    return f"trueflight/{vehicle}/{leaf}"
