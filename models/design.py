@@ -1,0 +1,151 @@
+"""The design file: the gains of the linear cascade, as the ground computed them for one vehicle."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from models.errors import InputError
+from models.vehicle import GRAVITY, Vehicle
+
+Matrix = tuple[tuple[float, ...], ...]
+
+_MASS_TOLERANCE = 0.01
+"""Relative difference of mass up to which a design still belongs to a vehicle: the rounding of a scale."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """Gains of the paper's cascade, (13) and (16), with what gave them.
+
+    `K_zeta` (3, 3) in 1/s maps the attitude error (roll, pitch, yaw; rad) to body rates. `K_eta` (3, 6) maps
+    `(xi - xi_ref, v - v_ref)` in the heading frame (m, m/s) to `(phi, theta, T)` in rad, rad, N. `weights` holds the
+    LQR weights Q and R of both loops, `rate` is the control rate in Hz they were chosen for, `mass` in kg is that of
+    the vehicle.
+    """
+
+    vehicle: str
+    mass: float
+    K_zeta: Matrix
+    K_eta: Matrix
+    weights: dict[str, Any] = field(default_factory=dict)
+    rate: float = 100.0
+    created_by: str = ""
+
+    def check(self, vehicle: Vehicle, where: str = "design") -> None:
+        """Raise `InputError` where the design belongs to another vehicle (by name or mass)."""
+        if self.vehicle != vehicle.name:
+            raise InputError(
+                f"{where}: made for vehicle '{self.vehicle}', not '{vehicle.name}'; run `groundstation design` for it"
+            )
+        if abs(self.mass - vehicle.mass) > _MASS_TOLERANCE * vehicle.mass:
+            raise InputError(
+                f"{where}: made for {self.mass:g} kg, the vehicle file says {vehicle.mass:g} kg; "
+                "run `groundstation design` again"
+            )
+
+
+def hover_input_matrix(mass: float) -> np.ndarray:
+    """`A_zeta` of (9): acceleration in the heading frame of (phi, theta, T - m g); shape (3, 3)."""
+    return np.array([[0.0, GRAVITY, 0.0], [-GRAVITY, 0.0, 0.0], [0.0, 0.0, 1.0 / mass]])
+
+
+def save_design(design: Design, path: str | Path) -> None:
+    """Write a design file (JSON)."""
+    Path(path).write_text(design_to_json(design), encoding="utf-8")
+
+
+def design_to_json(design: Design) -> str:
+    """The text of a design file."""
+    return json.dumps(asdict(design), indent=1) + "\n"
+
+
+def load_design(path: str | Path, vehicle: Vehicle | None = None) -> Design:
+    """Read and check a design file, and that it belongs to `vehicle` where one is given. Raises `InputError`."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot read the design file ({error.strerror}); make one with `groundstation design`"
+        ) from None
+    except UnicodeDecodeError:
+        raise InputError(
+            f"{path}: not a design file (not text); make one with `groundstation design`"
+        ) from None
+    design = design_from_json(text, str(path))
+    if vehicle is not None:
+        design.check(vehicle, str(path))
+    return design
+
+
+def design_from_json(text: str, where: str = "design") -> Design:
+    """Check the text of a design file; `where` names it in error messages."""
+    try:
+        table = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{where}: not valid JSON: {error}; make one with `groundstation design`") from None
+    if not isinstance(table, dict):
+        raise InputError(f"{where}: not a design file; make one with `groundstation design`")
+    known = {f.name for f in fields(Design)}
+    for key in table:
+        if key not in known:
+            raise InputError(f"{where}: unknown key '{key}'; known keys: {', '.join(sorted(known))}")
+    for key in ("vehicle", "mass", "K_zeta", "K_eta"):
+        if key not in table:
+            raise InputError(f"{where}: '{key}' is missing; make the file again with `groundstation design`")
+    if not isinstance(table["vehicle"], str) or not isinstance(table.get("created_by", ""), str):
+        raise InputError(f"{where}: 'vehicle' and 'created_by' must be texts")
+    if not isinstance(table.get("weights", {}), dict):
+        raise InputError(f"{where}: 'weights' must be an object")
+    design = Design(
+        vehicle=table["vehicle"],
+        mass=_positive(where, "mass", table["mass"]),
+        K_zeta=_matrix(where, "K_zeta", table["K_zeta"], (3, 3)),
+        K_eta=_matrix(where, "K_eta", table["K_eta"], (3, 6)),
+        weights=table.get("weights", {}),
+        rate=_positive(where, "rate", table.get("rate", 100.0)),
+        created_by=table.get("created_by", ""),
+    )
+    _check_stability(design, where)
+    return design
+
+
+def _positive(where: str, key: str, value: object) -> float:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float))
+        or not math.isfinite(value)
+        or value <= 0
+    ):
+        raise InputError(f"{where}: '{key}' must be a positive number, not {value!r}")
+    return float(value)
+
+
+def _matrix(where: str, key: str, value: object, shape: tuple[int, int]) -> Matrix:
+    try:
+        matrix = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != shape or not np.all(np.isfinite(matrix)):
+        raise InputError(f"{where}: '{key}' must be {shape[0]} rows of {shape[1]} finite numbers")
+    return tuple(tuple(float(x) for x in row) for row in matrix)
+
+
+def _check_stability(design: Design, where: str) -> None:
+    """Both loops of the linear design must be stable, or the file has a wrong sign or a wrong row order."""
+    a = np.zeros((6, 6))
+    a[:3, 3:] = np.eye(3)
+    b = np.vstack([np.zeros((3, 3)), hover_input_matrix(design.mass)])
+    loops = {"K_zeta": -np.array(design.K_zeta), "K_eta": a - b @ np.array(design.K_eta)}
+    for key, closed in loops.items():
+        slowest = float(np.linalg.eigvals(closed).real.max())
+        if slowest >= 0.0:
+            raise InputError(
+                f"{where}: {key} gives an unstable loop (a pole at {slowest:+.3g} 1/s); check signs and row order"
+            )
