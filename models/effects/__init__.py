@@ -1,0 +1,66 @@
+"""The catalogue of physical effects, one file each."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import pkgutil
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from models.effect import Effect
+from models.errors import InputError
+
+
+@cache
+def catalogue(directory: str | None = None) -> dict[str, Effect]:
+    """All known effects by name: the project's own, those of installed entry points (group `trueflight.effects`),
+    and every `*.py` of `directory`, the user's own.
+
+    Raises `InputError` where a user's file cannot be used or takes a name that is already there.
+    """
+    found: dict[str, Effect] = {}
+    for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
+        effect = importlib.import_module(f"{__name__}.{module}").EFFECT
+        found[effect.name] = effect
+    for entry in entry_points(group="trueflight.effects"):
+        _add(found, entry.load(), f"entry point {entry.name}")
+    if directory is not None:
+        folder = Path(directory)
+        if not folder.is_dir():
+            raise InputError(f"{directory}: no such folder of effects; pass --effects DIR with *.py files in it")
+        for path in sorted(folder.glob("*.py")):
+            _add(found, _load(path), str(path))
+    return found
+
+
+def _load(path: Path) -> object:
+    spec = importlib.util.spec_from_file_location(f"user_effect_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # noqa: BLE001 - a user's file may fail in any way; it is told in one line
+        raise InputError(f"{path}: cannot be loaded: {type(error).__name__}: {error}") from None
+    return getattr(module, "EFFECT", None)
+
+
+def _add(found: dict[str, Effect], effect: object, where: str) -> None:
+    if not isinstance(effect, Effect):
+        raise InputError(f"{where}: defines no EFFECT (an object of models.effect.Effect); add it")
+    if effect.name in found:
+        raise InputError(f"{where}: an effect named '{effect.name}' exists already; choose another name")
+    found[effect.name] = effect
+
+
+def effect_named(name: str, directory: str | None = None) -> Effect:
+    """One effect by name; raises `InputError` with the nearest names for an unknown one."""
+    import difflib
+
+    known = catalogue(directory)
+    if name not in known:
+        close = difflib.get_close_matches(name, known, 3)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"known: {', '.join(known)}"
+        raise InputError(f"unknown effect '{name}'; {hint}")
+    return known[name]

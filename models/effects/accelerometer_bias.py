@@ -1,0 +1,27 @@
+"""Constant offset of the accelerometer."""
+
+from array_api_compat import array_namespace
+
+from models.effect import Array, Effect, Motion, Parameter, Stage
+
+
+def formula(motion: Motion, *, x: Array, y: Array, z: Array) -> Motion:
+    """`f_measured = f + (x, y, z)`, body axes, m/s²: an error of the reading, not of the flight."""
+    xp = array_namespace(motion.thrust)
+    one = 0.0 * motion.thrust + 1.0
+    return motion.with_(reading=motion.reading + xp.stack([x * one, y * one, z * one], axis=-1))
+
+
+EFFECT = Effect(
+    name="accelerometer_bias",
+    title="constant offset of the accelerometer",
+    stage=Stage.SENSOR,
+    formula=formula,
+    parameters=tuple(
+        Parameter(axis, "m/s^2", f"offset along body {axis}", 0.0, 0.2, -2.0, 2.0) for axis in ("x", "y", "z")
+    ),
+    needs=("specific_force",),
+    manoeuvre="hover at several headings, and tilts both ways",
+    citation="IEEE Std 1293 error model of a linear accelerometer, bias term",
+    confounded_with=("thrust_gain", "thrust_curve", "wind"),
+)

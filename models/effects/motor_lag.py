@@ -1,0 +1,24 @@
+"""First-order lag from command to rotor speed."""
+
+import numpy as np
+
+from models.effect import Effect, Motion, Parameter, Stage
+
+
+def formula(motion: Motion, *, tau: float) -> Motion:
+    """`tau dw/dt + w = w_command` of rotor speed w, with thrust as w squared; `tau` is the whole time constant."""
+    return motion.with_(tau=float(np.asarray(tau)))
+
+
+EFFECT = Effect(
+    name="motor_lag",
+    title="thrust lags its command (rotor speed dynamics)",
+    stage=Stage.COMMAND,
+    formula=formula,
+    parameters=(Parameter("tau", "s", "time constant of rotor speed", "motor_time_constant", 0.05, 0.0, 0.4),),
+    needs=("thrust_command",),
+    manoeuvre="quick vertical steps: thrust changes within a few hundredths of a second",
+    citation="brushless motor and rotor as a first-order system in rotor speed (Bangura & Mahony 2014; Faessler 2017)",
+    confounded_with=("transport_delay",),
+    exports=False,
+)

@@ -1,0 +1,24 @@
+"""Pure delay from command to thrust."""
+
+import numpy as np
+
+from models.effect import Effect, Motion, Parameter, Stage
+
+
+def formula(motion: Motion, *, delay: float) -> Motion:
+    """`T(t) = T_command(t - delay)`; `delay` is the whole delay between the two columns of the record."""
+    return motion.with_(delay=float(np.asarray(delay)))
+
+
+EFFECT = Effect(
+    name="transport_delay",
+    title="thrust comes a fixed time after its command",
+    stage=Stage.COMMAND,
+    formula=formula,
+    parameters=(Parameter("delay", "s", "from logged command to motor", "command_delay", 0.04, 0.0, 0.3),),
+    needs=("thrust_command",),
+    manoeuvre="quick vertical steps: thrust changes within a few hundredths of a second",
+    citation="radio, serial line, driver protocol and clock offset between columns add up to one shift in time",
+    confounded_with=("motor_lag",),
+    exports=False,
+)

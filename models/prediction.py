@@ -1,0 +1,147 @@
+"""From a flight (or a table of features) to predicted acceleration, through a chain of effects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace
+
+from models.effect import Array, Effect, Motion, Stage
+from models.flight import Flight
+from models.frames import euler_from_quaternion, heading_from_world, rotation_matrix
+from models.lag import delayed, lagged
+from models.linear import hover_acceleration
+from models.vehicle import GRAVITY, Vehicle
+
+Chain = Sequence[tuple[Effect, Mapping[str, Any]]]
+"""Effects with parameter values, in the order in which they were added."""
+
+
+def motion_of_flight(flight: Flight) -> Motion:
+    """The flight as effects see it, before any of them acts. Needs `thrust_command`; other columns where present."""
+    n = len(flight)
+    command = flight.vehicle.thrust(flight.column("thrust_command")) / flight.vehicle.mass
+    zero = np.zeros((n, 3))
+    changes: dict[str, Any] = {}
+    if flight.quaternion is not None:
+        euler = euler_from_quaternion(flight.quaternion)
+        yaw = euler[:, 2]
+        body_to_world = rotation_matrix(flight.quaternion)
+        c, s = np.cos(yaw), np.sin(yaw)
+        rotation = body_to_world.copy()
+        rotation[:, 0] = c[:, None] * body_to_world[:, 0] + s[:, None] * body_to_world[:, 1]
+        rotation[:, 1] = -s[:, None] * body_to_world[:, 0] + c[:, None] * body_to_world[:, 1]
+        changes |= {"rotation": rotation, "euler": (euler[:, 0], euler[:, 1]), "cos_yaw": c, "sin_yaw": s}
+        if flight.velocity is not None:
+            changes["air_velocity"] = heading_from_world(flight.velocity, yaw)
+    if flight.position is not None:
+        changes["height"] = flight.position[:, 2]
+    if flight.battery_voltage is not None:
+        changes["voltage"] = flight.battery_voltage
+    return Motion(
+        vehicle=flight.vehicle,
+        dt=flight.dt,
+        command=command,
+        thrust=command,
+        force=zero,
+        reading=zero,
+        tau=flight.vehicle.motor_time_constant,
+        delay=flight.vehicle.command_delay,
+        **changes,
+    )
+
+
+def motion_of_features(columns: Mapping[str, Array], vehicle: Vehicle) -> Motion:
+    """The features (28) of `models.contract`, each (N,), as effects see them: no history, so no delay and no lag."""
+    thrust = columns["T"] / vehicle.mass
+    xp = array_namespace(thrust)
+    zero, one = 0.0 * thrust, 0.0 * thrust + 1.0
+    cp, sp, ct, st = (columns[k] for k in ("cos_phi", "sin_phi", "cos_theta", "sin_theta"))
+    rotation = xp.stack(
+        [
+            xp.stack([ct, st * sp, st * cp], axis=-1),
+            xp.stack([zero, cp, -sp], axis=-1),
+            xp.stack([-st, ct * sp, ct * cp], axis=-1),
+        ],
+        axis=1,
+    )
+    nothing = xp.stack([zero, zero, zero], axis=-1)
+    return Motion(
+        vehicle=vehicle,
+        dt=0.0,
+        command=thrust,
+        thrust=thrust,
+        force=nothing,
+        reading=nothing,
+        rotation=rotation,
+        euler=(xp.atan2(sp, cp), xp.atan2(st, ct)),
+        air_velocity=xp.stack([columns["vx"], columns["vy"], columns["vz"]], axis=-1),
+        cos_yaw=columns.get("cos_psi", one),
+        sin_yaw=columns.get("sin_psi", zero),
+        height=columns["z"],
+        voltage=columns["u_batt"],
+    )
+
+
+def act(motion: Motion, chain: Chain) -> Motion:
+    """The motion with the effects of `chain` acting, stage by stage."""
+    at: dict[Stage, list[tuple[Effect, Mapping[str, Any]]]] = {stage: [] for stage in Stage}
+    for effect, values in chain:
+        at[effect.stage].append((effect, values))
+    for effect, values in at[Stage.COMMAND]:
+        motion = effect.apply(motion, values)
+    if motion.tau > 0.0 or motion.delay > 0.0:
+        motion = _with_actuation(motion)
+    for effect, values in at[Stage.THRUST]:
+        motion = effect.apply(motion, values)
+    if motion.euler is not None:
+        motion = motion.with_(thrust_acceleration=linear_thrust(motion))
+    for stage in (Stage.ROTATION, Stage.AIR, Stage.FORCE, Stage.SENSOR):
+        for effect, values in at[stage]:
+            motion = effect.apply(motion, values)
+    return motion
+
+
+def _with_actuation(motion: Motion) -> Motion:
+    """Delay and lag act on rotor speed, the root of thrust (a negative command stands still)."""
+    speed = np.sqrt(np.clip(motion.command, 0.0, None))
+    acting = lagged(delayed(speed, motion.delay, motion.dt), motion.tau, motion.dt) ** 2
+    return motion.with_(command=acting, thrust=acting)
+
+
+def linear_thrust(motion: Motion) -> Array:
+    """What the hover linearisation makes of the thrust: heading-frame acceleration plus gravity, (N, 3), m/s²."""
+    assert motion.euler is not None
+    xp = array_namespace(motion.thrust)
+    acceleration = hover_acceleration(*motion.euler, motion.thrust)
+    return acceleration + xp.stack([0.0 * motion.thrust, 0.0 * motion.thrust, 0.0 * motion.thrust + GRAVITY], axis=-1)
+
+
+def to_heading(motion: Motion, body: Array) -> Array:
+    """Body vectors (N, 3) in the heading frame."""
+    xp = array_namespace(motion.thrust)
+    return xp.sum(motion.rotation * body[:, None, :], axis=2)
+
+
+def acceleration(motion: Motion) -> Array:
+    """Acceleration (N, 3) of the vehicle, heading frame, m/s², of a motion that effects have acted on."""
+    xp = array_namespace(motion.thrust)
+    gravity = xp.stack([0.0 * motion.thrust, 0.0 * motion.thrust, 0.0 * motion.thrust + GRAVITY], axis=-1)
+    return motion.thrust_acceleration + to_heading(motion, motion.force) - gravity
+
+
+def specific_force(motion: Motion) -> np.ndarray:
+    """What the accelerometer reads (N, 3), body axes, m/s²; without attitude, thrust along the body's z axis."""
+    if motion.rotation is None:
+        return motion.force + motion.reading + np.outer(motion.thrust, [0.0, 0.0, 1.0])
+    thrust = np.einsum("nji,nj->ni", motion.rotation, motion.thrust_acceleration)
+    return thrust + motion.force + motion.reading
+
+
+def error_acceleration(motion: Motion, chain: Chain) -> Array:
+    """`delta_hat` (N, 3): acceleration of the chain minus the hover linearisation at the same input, heading frame."""
+    linear = linear_thrust(motion)
+    acted = act(motion, chain)
+    return acted.thrust_acceleration + to_heading(acted, acted.force) - linear
