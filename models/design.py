@@ -24,9 +24,9 @@ class Design:
     """Gains of the paper's cascade, (13) and (16), with what gave them.
 
     `K_zeta` (3, 3) in 1/s maps the attitude error (roll, pitch, yaw; rad) to body rates. `K_eta` (3, 6) maps
-    `(xi - xi_ref, v - v_ref)` in the heading frame (m, m/s) to `(phi, theta, T)` in rad, rad, N. `weights` holds the
-    LQR weights Q and R of both loops, `rate` is the control rate in Hz they were chosen for, `mass` in kg is that of
-    the vehicle.
+    `(xi - xi_ref, v - v_ref)` in the heading frame (m, m/s) to `(phi, theta, T)` in rad, rad, N. `weights`
+    holds the LQR weights Q and R of both loops, `rate` is the control rate in Hz they were chosen for, `mass`
+    in kg is that of the vehicle.
     """
 
     vehicle: str
@@ -41,7 +41,8 @@ class Design:
         """Raise `InputError` where the design belongs to another vehicle (by name or mass)."""
         if self.vehicle != vehicle.name:
             raise InputError(
-                f"{where}: made for vehicle '{self.vehicle}', not '{vehicle.name}'; run `groundstation design` for it"
+                f"{where}: made for vehicle '{self.vehicle}', not '{vehicle.name}'; "
+                "run `groundstation design` for it"
             )
         if abs(self.mass - vehicle.mass) > _MASS_TOLERANCE * vehicle.mass:
             raise InputError(
@@ -66,7 +67,7 @@ def design_to_json(design: Design) -> str:
 
 
 def load_design(path: str | Path, vehicle: Vehicle | None = None) -> Design:
-    """Read and check a design file, and that it belongs to `vehicle` where one is given. Raises `InputError`."""
+    """Read and check a design file (and that it belongs to `vehicle`, where given). Raises `InputError`."""
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -147,5 +148,6 @@ def _check_stability(design: Design, where: str) -> None:
         slowest = float(np.linalg.eigvals(closed).real.max())
         if slowest >= 0.0:
             raise InputError(
-                f"{where}: {key} gives an unstable loop (a pole at {slowest:+.3g} 1/s); check signs and row order"
+                f"{where}: {key} gives an unstable loop (a pole at {slowest:+.3g} 1/s); "
+                "check signs and row order"
             )

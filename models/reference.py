@@ -1,4 +1,6 @@
-"""The trajectories that can be flown by name, with their parameters, and those read from a table of setpoints."""
+"""The trajectories that can be flown by name, with their parameters, and those read from a table of
+setpoints.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ ACCELERATION = 4.0
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number (or, with `choices`, a word) that shapes a trajectory; lengths m, times s, angles rad, speeds m/s."""
+    """A number (or, with `choices`, a word) that shapes a trajectory; lengths m, times s, angles rad, speeds
+    m/s.
+    """
 
     name: str
     default: float | str
@@ -111,7 +115,8 @@ def _checked(name: str, parameter: Parameter, value: object) -> float | str:
         raise InputError(f"{where} must be a number, not {value!r}") from None
     if not parameter.low <= number <= parameter.high:  # false for NaN as well
         raise InputError(
-            f"{where} = {number:g} is outside {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
+            f"{where} = {number:g} is outside {parameter.low:g} to {parameter.high:g} "
+            f"{parameter.unit}".rstrip()
         )
     return number
 
@@ -338,8 +343,8 @@ def _low_pass(
 
 @_kind(
     "excitation",
-    "a survey of about 45 s that shows every effect: heights down to `low`, fast and slow along both axes, at two "
-    "yaws, and hard vertical moves",
+    "a survey of about 45 s that shows every effect: heights down to `low`, fast and slow along both axes, "
+    "at two yaws, and hard vertical moves",
     Parameter("low", 0.2, 0.08, 5.0, "m", "lowest height above ground"),
     Parameter("size", 2.2, 0.5, 20.0, "m", "half the length of the passes"),
     Parameter("speed", 4.0, 0.5, 12.0, "m/s", "greatest reference speed"),
@@ -380,10 +385,12 @@ _OPTIONAL = ("vx", "vy", "vz", "ax", "ay", "az", "yaw")
 
 
 def trajectory_from_csv(text: str, where: str = "setpoints") -> Trajectory:
-    """A trajectory from setpoints: columns `t,x,y,z`, optionally `vx,vy,vz`, `ax,ay,az`, `yaw` (SI, rad, home frame).
+    """A trajectory from setpoints: columns `t,x,y,z`, optionally `vx,vy,vz`, `ax,ay,az`, `yaw` (SI, rad, home
+    frame).
 
     Between two rows it runs along a quintic. Where velocities or accelerations are not given they are central
-    differences of the rows, and zero at both ends. Raises `InputError` with line and column for what cannot be used.
+    differences of the rows, and zero at both ends. Raises `InputError` with line and column for what cannot
+    be used.
     """
     rows = list(csv.reader(io.StringIO(text.lstrip("\ufeff"))))
     rows = [row for row in rows if row and not row[0].lstrip().startswith("#")]
@@ -448,7 +455,9 @@ def _numbers(rows: list[list[str]], names: list[str], where: str) -> np.ndarray:
 
 
 def _differences(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Central differences (second order on uneven spacing), zero at both ends: setpoints begin and end at rest."""
+    """Central differences (second order on uneven spacing), zero at both ends: setpoints begin and end at
+    rest.
+    """
     slope = np.gradient(values, t, axis=0) if len(t) > 1 else np.zeros_like(values)
     slope[0] = slope[-1] = 0.0
     return slope

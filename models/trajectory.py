@@ -1,10 +1,11 @@
-"""Reference trajectories: what a flight is asked to do, as position, velocity, acceleration and yaw over time.
+"""Reference trajectories: what a flight is asked to do, as position, velocity, acceleration and yaw over
+time.
 
-A trajectory lives in a frame whose origin is *home*: the ground under the vehicle at arming, axes of the world (ENU).
-So z is height above ground, yaw is the world's, and whoever flies it adds the home position. It is made of
-segments of two kinds: polynomials of time (holds, minimum-jerk transfers, tables of setpoints) and curves whose
-phase runs up smoothly, cruises and runs down again (circles, spirals, lemniscates). The same formulas serve the control
-loop (plain floats, a few microseconds a sample) and the ground (arrays).
+A trajectory lives in a frame whose origin is *home*: the ground under the vehicle at arming, axes of the
+world (ENU). So z is height above ground, yaw is the world's, and whoever flies it adds the home position. It
+is made of segments of two kinds: polynomials of time (holds, minimum-jerk transfers, tables of setpoints) and
+curves whose phase runs up smoothly, cruises and runs down again (circles, spirals, lemniscates). The same
+formulas serve the control loop (plain floats, a few microseconds a sample) and the ground (arrays).
 
 Minimum-jerk transfers: Flash and Hogan, "The coordination of arm movements", J. Neuroscience 5(7), 1985.
 """
@@ -16,6 +17,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +33,9 @@ MIN_JERK_ACCELERATION = 10.0 / math.sqrt(3.0)
 
 
 class ReferenceSample(NamedTuple):
-    """The reference at one time: m, m/s, m/s² in the axes of the world (ENU) from home; yaw in rad, yaw rate rad/s."""
+    """The reference at one time: m, m/s, m/s² in the axes of the world (ENU) from home; yaw in rad, yaw rate
+    rad/s.
+    """
 
     position: Vector
     velocity: Vector
@@ -42,7 +46,9 @@ class ReferenceSample(NamedTuple):
 
 @dataclass(frozen=True)
 class ReferenceColumns:
-    """The reference at N times: `t` (N,) s, position, velocity, acceleration (N, 3) ENU from home, yaw (N,) rad."""
+    """The reference at N times: `t` (N,) s, position, velocity, acceleration (N, 3) ENU from home, yaw (N,)
+    rad.
+    """
 
     t: np.ndarray
     position: np.ndarray
@@ -53,12 +59,14 @@ class ReferenceColumns:
 
 @dataclass(frozen=True)
 class Polynomial:
-    """x, y, z, yaw as polynomials of the segment's own time: four rows of six coefficients, lowest power first."""
+    """x, y, z, yaw as polynomials of the segment's own time: four rows of six coefficients, lowest power
+    first.
+    """
 
     duration: float
     coefficients: tuple[tuple[float, ...], ...]
 
-    def evaluate(self, t: Any, xp: Any) -> tuple[tuple[Any, Any, Any], ...]:  # noqa: ARG002
+    def evaluate(self, t: Any, xp: Any) -> tuple[tuple[Any, Any, Any], ...]:
         """Value, first and second derivative of each of the four channels at `t` (float or array)."""
         out = []
         for c0, c1, c2, c3, c4, c5 in self.coefficients:
@@ -71,7 +79,9 @@ class Polynomial:
 
 @dataclass(frozen=True)
 class Wave:
-    """One channel of a curve over its phase s: `offset + slope s + (amplitude + growth s) sin(frequency s + phase)`."""
+    """One channel of a curve over its phase s: `offset + slope s + (amplitude + growth s) sin(frequency s +
+    phase)`.
+    """
 
     offset: float
     slope: float = 0.0
@@ -83,10 +93,11 @@ class Wave:
 
 @dataclass(frozen=True)
 class Curve:
-    """Four waves over a phase s that runs from 0 to 1: smoothly up during `ramp` s, at constant rate, and down again.
+    """Four waves over a phase s that runs from 0 to 1: smoothly up during `ramp` s, at constant rate, and
+    down again.
 
-    The rate of s follows a cubic smoothstep during the ramps, so that velocity and acceleration are continuous and
-    zero at both ends.
+    The rate of s follows a cubic smoothstep during the ramps, so that velocity and acceleration are
+    continuous and zero at both ends.
     """
 
     duration: float
@@ -227,7 +238,9 @@ def min_jerk(begin: Waypoint, end: Waypoint, duration: float) -> Polynomial:
 def transfer_time(
     begin: Waypoint, end: Waypoint, speed: float, acceleration: float, yaw_rate: float = 1.5
 ) -> float:
-    """Duration in s of a minimum-jerk transfer that keeps below `speed`, `acceleration` and `yaw_rate` (rad/s)."""
+    """Duration in s of a minimum-jerk transfer that keeps below `speed`, `acceleration` and `yaw_rate`
+    (rad/s).
+    """
     distance = math.dist(begin[:3], end[:3])
     turn = abs(end[3] - begin[3])
     return max(
@@ -248,9 +261,9 @@ def transfer(begin: Waypoint, end: Waypoint, speed: float, acceleration: float) 
 def path(
     waypoints: Sequence[Waypoint], speed: float, acceleration: float, pause: float = 0.0
 ) -> list[Segment]:
-    """Minimum-jerk transfers from waypoint to waypoint, standing still for `pause` s at each but the first."""
+    """Minimum-jerk transfers from waypoint to waypoint, with a `pause` (s) at each but the first."""
     segments: list[Segment] = []
-    for begin, end in zip(waypoints[:-1], waypoints[1:], strict=True):
+    for begin, end in pairwise(waypoints):
         segments.append(min_jerk(begin, end, transfer_time(begin, end, speed, acceleration)))
         if pause > 0.0:
             segments.append(hold(end, pause))
@@ -258,7 +271,9 @@ def path(
 
 
 def quintic(duration: float, begin: Sequence[Sequence[float]], end: Sequence[Sequence[float]]) -> Polynomial:
-    """Quintic Hermite segment; `begin` and `end` hold value, first and second derivative of each of four channels."""
+    """Quintic Hermite segment; `begin` and `end` hold value, first and second derivative of each of four
+    channels.
+    """
     rows, d = [], duration
     for (p0, v0, a0), (p1, v1, a1) in zip(begin, end, strict=True):
         p, v, a = p1 - p0 - v0 * d - 0.5 * a0 * d * d, v1 - v0 - a0 * d, a1 - a0

@@ -1,0 +1,373 @@
+"""The flight record: one MCAP file per flight, appended while flying and readable after a power cut.
+
+Messages are the protobuf `Tick` and `Event` of `record.proto`, with their schema in the file, so that Rerun
+and Foxglove open it. The vehicle file and the design travel as attachments at its beginning. Format: MCAP
+specification, https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import struct
+import threading
+import time
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import DecodeError
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+from models.design import Design, design_from_json, design_to_json
+from models.errors import InputError
+from models.record_pb2 import DESCRIPTOR, Event, Tick
+from models.vehicle import Vehicle, vehicle_from_table
+
+TICK_TOPIC, EVENT_TOPIC = "/tick", "/event"
+CHUNK_BYTES = 16 * 1024
+"""A chunk holds about 40 ticks, so that a cut loses 0.4 s at 100 Hz and less at higher rates."""
+SYNC_PERIOD = 0.5
+"""Seconds between two times that what was written is forced to the disk."""
+
+
+class FlightRecorder:
+    """Writes one flight record from a thread of its own; the caller never waits for the disk.
+
+    `tick` and `event` only enqueue serialised messages. When the queue is full the message is dropped and
+    counted; the count stands in the file's metadata `end` and in an event. A recorder that was never closed
+    (a power cut, SIGKILL) leaves a readable file that misses at most the last chunk.
+
+    `metadata` is free text by key, written at the beginning. `queue_limit` is the greatest number of messages
+    that wait for the disk. Raises `InputError` where the file cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        vehicle: Vehicle,
+        design: Design | None = None,
+        metadata: dict[str, str] | None = None,
+        queue_limit: int = 4096,
+    ) -> None:
+        self.path = Path(path)
+        self.dropped = 0
+        self.error = ""
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self.path.open("xb")
+        except OSError as error:
+            raise InputError(f"{path}: cannot write the flight record ({error.strerror})") from None
+        self._queue: queue.Queue[tuple[int, int, int, bytes] | None] = queue.Queue(queue_limit)
+        self._epoch = time.time_ns() - time.monotonic_ns()
+        self._sequence = [0, 0]
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="trueflight", library="trueflight")
+        schemas = FileDescriptorSet()
+        DESCRIPTOR.CopyToProto(schemas.file.add())
+        self._channels = []
+        for topic, kind in ((TICK_TOPIC, Tick), (EVENT_TOPIC, Event)):
+            name = kind.DESCRIPTOR.full_name
+            schema = self._writer.register_schema(name, "protobuf", schemas.SerializeToString())
+            self._channels.append(self._writer.register_channel(topic, "protobuf", schema))
+        now = time.time_ns()
+        self._writer.add_metadata(
+            "flight", {"vehicle": vehicle.name, "created_ns": str(now), **(metadata or {})}
+        )
+        self._writer.add_attachment(
+            now, now, "vehicle.toml", "application/toml", vehicle_to_toml(vehicle).encode()
+        )
+        if design is not None:
+            self._writer.add_attachment(
+                now, now, "design.json", "application/json", design_to_json(design).encode()
+            )
+        self._file.flush()
+        self._thread = threading.Thread(target=self._write, name="flight-recorder", daemon=True)
+        self._thread.start()
+
+    def tick(self, tick: Tick | bytes, vehicle_time_us: int, host_time_ns: int) -> None:
+        """Enqueue a tick (message, or its serialised bytes where the caller has them already)."""
+        self._put(
+            0, vehicle_time_us, host_time_ns, tick if isinstance(tick, bytes) else tick.SerializeToString()
+        )
+
+    def event(self, event: Event) -> None:
+        """Enqueue an event."""
+        self._put(1, event.vehicle_time_us, event.host_time_ns, event.SerializeToString())
+
+    def close(self, timeout: float = 10.0) -> None:
+        """Write what is queued and the index, and close the file. Idempotent."""
+        if self._thread.is_alive():
+            self._queue.put(None, timeout=timeout)
+            self._thread.join(timeout)
+
+    def __enter__(self) -> FlightRecorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _put(self, channel: int, vehicle_time_us: int, host_time_ns: int, data: bytes) -> None:
+        try:
+            self._queue.put_nowait((channel, vehicle_time_us * 1000, host_time_ns, data))
+        except queue.Full:
+            self.dropped += 1
+
+    def _write(self) -> None:
+        synced, unsynced = time.monotonic(), False
+        while True:
+            try:
+                item = self._queue.get(timeout=SYNC_PERIOD)
+            except queue.Empty:
+                item = ()  # type: ignore[assignment]
+            try:
+                if item is None:
+                    self._finish()
+                    return
+                if item:
+                    self._append(*item)
+                    unsynced = True
+                if unsynced and time.monotonic() - synced >= SYNC_PERIOD:
+                    self._file.flush()
+                    os.fdatasync(self._file.fileno())
+                    synced, unsynced = time.monotonic(), False
+            except OSError as error:  # a full disk must not stop a flight; it is told instead
+                self.error = f"{self.path}: {error.strerror}"
+                self._file.close()
+                return
+
+    def _append(self, channel: int, log_time: int, host_time: int, data: bytes) -> None:
+        self._sequence[channel] += 1
+        # log_time is the vehicle's clock (in simulation faster than the wall), publish_time the wall's.
+        self._writer.add_message(
+            self._channels[channel], log_time, data, host_time + self._epoch, self._sequence[channel]
+        )
+
+    def _finish(self) -> None:
+        counts = {"dropped": self.dropped, "ticks": self._sequence[0], "events": self._sequence[1]}
+        self._writer.add_metadata("end", {key: str(value) for key, value in counts.items()})
+        self._writer.finish()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+
+
+def vehicle_to_toml(vehicle: Vehicle) -> str:
+    """The text of a vehicle file that loads to an equal `Vehicle`."""
+    lines = []
+    for name in Vehicle.__dataclass_fields__:
+        value = getattr(vehicle, name)
+        if name == "source":
+            continue
+        if isinstance(value, str):
+            lines.append(f'{name} = "{value}"')
+        else:
+            lines.append(f"{name} = {_toml(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml(x) for x in value) + "]"
+    return repr(value)
+
+
+@dataclass(frozen=True)
+class FlightRecord:
+    """A flight record as read.
+
+    `ticks` maps column names to arrays (N,) or (N, k): those of `models.flight.COLUMNS` plus `t` (s of the
+    vehicle's clock since the first tick), `vehicle_time` and `host_time` (s), `feedback_thrust` (N),
+    `feedback_body_rate` (rad/s), `correction`, `correction_raw` (m/s², heading frame), `interval`, `latency`,
+    `inference` (s), `setpoint_sent`, `armed` (bool) and the words `model`, `controller`, `flight_mode`,
+    `phase`, `guard`, `trajectory`. What was never known is absent; what is missing in a tick is NaN.
+    `truncated` tells that the file has no proper end, `notes` what that and any drops mean.
+    """
+
+    path: str
+    ticks: dict[str, np.ndarray]
+    events: tuple[Event, ...]
+    metadata: dict[str, str] = field(default_factory=dict)
+    vehicle: Vehicle | None = None
+    design: Design | None = None
+    truncated: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def read_record(path: str | Path) -> FlightRecord:
+    """Read a flight record, also one that a power cut left without its end.
+
+    Raises `InputError` for a file that cannot be read, is no MCAP, or holds no tick.
+    """
+    path = Path(path)
+    raw = _Raw()
+    try:
+        with path.open("rb") as stream:
+            end = _read_all(stream, raw)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the flight record ({error.strerror})") from None
+    except (InvalidMagic, struct.error):
+        raise InputError(f"{path}: not an MCAP file; give a record written by `companion`") from None
+    if not raw.ticks:
+        what = "other topics only" if raw.foreign else "no tick"
+        raise InputError(f"{path}: holds {what}{'' if end is None else f' ({end})'}; nothing was flown in it")
+    notes = []
+    if end is not None:
+        notes.append(f"the file is not whole ({end}); {len(raw.ticks)} ticks were recovered")
+    if int(raw.metadata.get("dropped", "0")):
+        notes.append(
+            f"{raw.metadata['dropped']} messages were dropped while recording: the disk was too slow"
+        )
+    vehicle = design = None
+    if "vehicle.toml" in raw.attachments:
+        try:
+            table = tomllib.loads(raw.attachments["vehicle.toml"].decode())
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: its vehicle.toml is damaged: {error}; pass --vehicle FILE") from None
+        vehicle = vehicle_from_table(table, f"{path}:vehicle.toml")
+    if "design.json" in raw.attachments:
+        design = design_from_json(raw.attachments["design.json"].decode(), f"{path}:design.json")
+    return FlightRecord(
+        str(path),
+        tick_columns(raw.ticks),
+        tuple(raw.events),
+        raw.metadata,
+        vehicle,
+        design,
+        end is not None,
+        tuple(notes),
+    )
+
+
+@dataclass
+class _Raw:
+    ticks: list[Tick] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    metadata: dict[str, str] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    foreign: bool = False
+
+
+def _read_all(stream: Any, raw: _Raw) -> str | None:
+    """Collect every record; returns None for a proper end, otherwise how the file ended."""
+    schemas: dict[int, str] = {}
+    channels: dict[int, str] = {}
+    damaged = 0
+    try:
+        for record in StreamReader(stream, emit_chunks=True, record_size_limit=1 << 28).records:
+            if isinstance(record, Metadata):
+                raw.metadata.update(record.metadata)
+            elif isinstance(record, Attachment):
+                raw.attachments[record.name] = record.data
+            elif isinstance(record, Chunk):
+                try:
+                    parts = breakup_chunk(record, validate_crc=True)
+                except Exception:  # noqa: BLE001 - each decompressor raises its own kind
+                    damaged += 1
+                    continue
+                _read_parts(parts, raw, schemas, channels)
+            else:
+                _read_parts([record], raw, schemas, channels)
+    except EndOfFile:
+        return "cut off inside a chunk"
+    except (InvalidMagic, struct.error):
+        if not raw.ticks:
+            raise
+        return "its last bytes are missing"
+    except (McapError, DecodeError, ValueError, MemoryError) as error:
+        return f"damaged after {len(raw.ticks)} ticks: {error}"
+    return f"{damaged} damaged chunks" if damaged else None
+
+
+def _read_parts(
+    parts: Iterable[McapRecord], raw: _Raw, schemas: dict[int, str], channels: dict[int, str]
+) -> None:
+    for record in parts:
+        if isinstance(record, Schema):
+            schemas[record.id] = record.name
+        elif isinstance(record, Channel):
+            channels[record.id] = schemas.get(record.schema_id, "")
+        elif isinstance(record, Message):
+            kind = channels.get(record.channel_id, "")
+            if kind == Tick.DESCRIPTOR.full_name:
+                raw.ticks.append(Tick.FromString(record.data))
+            elif kind == Event.DESCRIPTOR.full_name:
+                raw.events.append(Event.FromString(record.data))
+            else:
+                raw.foreign = True
+
+
+_SCALARS = {
+    "thrust_command": float,
+    "battery_voltage": float,
+    "yaw_reference": float,
+    "interval": float,
+    "latency": float,
+    "inference": float,
+    "setpoint_sent": bool,
+    "armed": bool,
+    "model": str,
+    "controller": str,
+    "flight_mode": str,
+    "phase": str,
+    "guard": str,
+    "trajectory": str,
+}
+_VECTORS = (
+    "position",
+    "velocity",
+    "angular_velocity",
+    "specific_force",
+    "position_reference",
+    "velocity_reference",
+    "acceleration_reference",
+    "correction",
+    "correction_raw",
+    "body_rate_command",
+)
+
+
+def tick_columns(ticks: Iterable[Tick]) -> dict[str, np.ndarray]:
+    """Columns of ticks, as described in `FlightRecord`."""
+    ticks = list(ticks)
+    columns: dict[str, np.ndarray] = {}
+    for name, kind in _SCALARS.items():
+        columns[name] = np.array([getattr(tick, name) for tick in ticks], dtype=kind)
+    for name in _VECTORS:
+        columns[name] = np.array([_vector(tick, name) for tick in ticks], dtype=float).reshape(-1, 3)
+    columns["quaternion"] = np.array(
+        [(t.quaternion.w, t.quaternion.x, t.quaternion.y, t.quaternion.z) for t in ticks], dtype=float
+    ).reshape(-1, 4)
+    columns["feedback_thrust"] = np.array([tick.feedback.thrust for tick in ticks], dtype=float)
+    columns["feedback_body_rate"] = np.array(
+        [(t.feedback.body_rate.x, t.feedback.body_rate.y, t.feedback.body_rate.z) for t in ticks], dtype=float
+    ).reshape(-1, 3)
+    columns["rotor_speed"] = np.array(
+        [tuple(t.rotor_speed)[:4] if len(t.rotor_speed) >= 4 else (np.nan,) * 4 for t in ticks], dtype=float
+    ).reshape(-1, 4)
+    columns["battery_voltage"][columns["battery_voltage"] == 0.0] = np.nan
+    for name in ("specific_force", "rotor_speed", "battery_voltage", "position_reference"):
+        if not np.any(np.isfinite(columns[name])):
+            del columns[name]
+    vehicle_time = np.array([tick.vehicle_time_us for tick in ticks], dtype=np.int64)
+    columns["vehicle_time"] = vehicle_time * 1e-6
+    columns["host_time"] = np.array([tick.host_time_ns for tick in ticks], dtype=np.int64) * 1e-9
+    columns["t"] = (vehicle_time - vehicle_time[:1]) * 1e-6
+    return columns
+
+
+def _vector(tick: Tick, name: str) -> tuple[float, float, float]:
+    if not tick.HasField(name):
+        return (np.nan, np.nan, np.nan)
+    vector = getattr(tick, name)
+    return (vector.x, vector.y, vector.z)
