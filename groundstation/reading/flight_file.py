@@ -1,0 +1,200 @@
+"""From a file to a checked `Flight`, whatever wrote it."""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from groundstation.reading import plausible
+from groundstation.reading.airborne import flying_mask
+from groundstation.reading.table import Table, own_columns, read_table, unknown_columns
+from groundstation.reading.uniform import even_clock
+from models.errors import InputError
+from models.flight import Flight
+from models.vehicle import Vehicle, load_vehicle
+
+TABLES = (".csv", ".txt", ".tsv", ".parquet", ".pq")
+RECORDS = (".mcap",)
+ULOGS = (".ulg", ".ulog")
+
+
+def read_flight(
+    path: str | Path, vehicle: str | Path | Vehicle | None = None, mapping: str | Path | None = None
+) -> Flight:
+    """Read a flight: the project's CSV or Parquet, any table through a column `mapping`, MCAP record or PX4
+    ULog.
+
+    `vehicle` is a vehicle or its file; without it `vehicle.toml` beside the flight is taken (a record of the
+    companion carries its own). A mapping `NAME.mapping.toml` or `mapping.toml` beside a table is taken by
+    itself. Raises `InputError`, in one line, for whatever makes the file unfit for analysis.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; check the path (`groundstation flights DIR` lists flights)")
+    if suffix in RECORDS:
+        from groundstation.reading.flight_record import read_flight_record
+
+        return read_flight_record(path, vehicle if vehicle is not None else _vehicle_beside(path))
+    if suffix in ULOGS:
+        from groundstation.reading.ulog import read_ulog
+
+        return read_ulog(path, _vehicle(path, vehicle))
+    if suffix not in TABLES:
+        known = ", ".join((*TABLES, *RECORDS, *ULOGS))
+        raise InputError(f"{path}: '{suffix}' is no kind of flight file; known are {known}")
+    table = read_table(path)
+    believed = _vehicle(path, vehicle)
+    mapping = mapping or _mapping_beside(path, table)
+    if mapping is not None:
+        from groundstation.reading.mapping import apply_mapping, load_mapping
+
+        mapped = apply_mapping(table, load_mapping(Path(mapping)), believed)
+        return assemble(
+            path, believed, mapped.t, mapped.columns, table.place,
+            extra=mapped.extra, flying=None, notes=(*table.notes, *mapped.notes),
+        )  # fmt: skip
+    columns = own_columns(table)
+    extra = unknown_columns(table)
+    flying = table.columns["flying"] > 0.5 if "flying" in table.columns else None
+    return assemble(
+        path,
+        believed,
+        table.columns["t"],
+        columns,
+        table.place,
+        extra=extra,
+        flying=flying,
+        notes=table.notes,
+    )
+
+
+def assemble(
+    path: Path,
+    vehicle: Vehicle,
+    t: np.ndarray,
+    columns: dict[str, np.ndarray],
+    place: Callable[[int], str],
+    *,
+    extra: dict[str, np.ndarray] | None = None,
+    flying: np.ndarray | None = None,
+    notes: tuple[str, ...] = (),
+) -> Flight:
+    """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
+    find what was flown. `place(row)` names a row in messages. Raises `InputError` for anything that cannot be
+    analysed."""
+    origin = str(path)
+    _check_groups(origin, columns)
+    plausible.check_clock(t, place)
+    said = list(notes)
+    names = list(columns)
+    every = {**columns, **{f"extra {k}": v for k, v in (extra or {}).items()}}
+    if flying is not None:
+        every["flying"] = np.asarray(flying, dtype=bool)
+    t, every, more = plausible.without_duplicates(t, every)
+    said += more
+    given = {name: every[name] for name in names}
+    others = {name: column for name, column in every.items() if name not in given}
+    index = np.arange(len(t))
+    _, given_and_index, more = plausible.complete(t, {**given, "row": index}, place)
+    kept = given_and_index.pop("row")
+    t, given = t[kept], given_and_index
+    others = {name: column[kept] for name, column in others.items()}
+    said += more
+    plausible.check_units(given, vehicle, origin)
+    given = plausible.continuous(given)
+    t, every, more = even_clock(t, {**given, **others}, origin)
+    said += more
+    given = {name: every[name] for name in given}
+    if "thrust_command" not in given:
+        given["thrust_command"] = given["motor_command"].mean(axis=1)
+        said.append("no collective command in the log: thrust_command is the mean of the motor commands")
+    in_air = every["flying"] if flying is not None else flying_mask(t, given, vehicle)
+    dt = float(np.median(np.diff(t)))
+    seconds = float(in_air.sum()) * dt
+    if seconds < plausible.SHORTEST:
+        raise InputError(
+            f"{origin}: only {seconds:.1f} s of {t[-1] - t[0]:.1f} s are in the air; at least "
+            f"{plausible.SHORTEST:g} s are needed (check hover_thrust of the vehicle file, or fly longer)"
+        )
+    if not np.all(in_air):
+        first, last = t[in_air][0], t[in_air][-1]
+        said.append(
+            f"{seconds:.1f} s of {t[-1] - t[0]:.1f} s are in the air, from t = {first:.1f} to {last:.1f} "
+            "s; the rest "
+            "(ground, takeoff, landing) is left out"
+        )
+    plausible.check_specific_force(given, in_air, origin)
+    plausible.check_attitude(t, given, in_air, origin)
+    plausible.check_motion(t, given, in_air, origin)
+    return Flight(
+        name=path.stem,
+        vehicle=vehicle,
+        t=t,
+        **given,  # type: ignore[arg-type]
+        flying=in_air,
+        accelerometer="specific_force" in given,
+        origin=origin,
+        data_hash=hashlib.sha256(path.read_bytes()).hexdigest(),
+        notes=tuple(said),
+        extra={name.removeprefix("extra "): every[name] for name in others if name.startswith("extra ")},
+    )
+
+
+def _check_groups(origin: str, columns: dict[str, np.ndarray]) -> None:
+    """What no analysis can do without: a command, and something that was measured in answer to it."""
+    if "thrust_command" not in columns and "motor_command" not in columns:
+        raise InputError(
+            f"{origin}: no thrust_command (nor motor_command_1..4): without the command nothing can be "
+            "predicted; add "
+            "the column, or name yours in a mapping (--mapping)"
+        )
+    moves = "quaternion" in columns and ("velocity" in columns or "position" in columns)
+    if "specific_force" not in columns and not moves:
+        raise InputError(
+            f"{origin}: neither an accelerometer (specific_force_x, y, z) nor attitude with velocity or "
+            "position "
+            "(quaternion_*, velocity_*); add one of them, or name yours in a mapping (--mapping)"
+        )
+
+
+def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:
+    if isinstance(vehicle, Vehicle):
+        return vehicle
+    if vehicle is not None:
+        return load_vehicle(vehicle)
+    if (beside := _vehicle_beside(path)) is not None:
+        return load_vehicle(beside)
+    raise InputError(
+        f"{path}: no vehicle.toml beside it; pass --vehicle FILE (mass, hover_thrust and rotors as you "
+        "believe them)"
+    )
+
+
+def _vehicle_beside(path: Path) -> Path | None:
+    candidates = (path.with_suffix(".vehicle.toml"), path.parent / "vehicle.toml")
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _mapping_beside(path: Path, table: Table) -> Path | None:
+    """The mapping beside a table that is not in the project's own format."""
+    if "t" in table.columns and ("thrust_command" in table.columns or "motor_command_1" in table.columns):
+        return None
+    for beside in (path.with_suffix(".mapping.toml"), path.parent / "mapping.toml"):
+        if beside.is_file():
+            return beside
+    return None
+
+
+def read_toml(path: Path, what: str) -> dict[str, object]:
+    """A TOML file's table. Raises `InputError` for a missing file or a syntax error."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the {what} ({error.strerror}); check the path") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}; correct that line") from None

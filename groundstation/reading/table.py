@@ -1,0 +1,185 @@
+"""Tables of numbers from CSV and Parquet files, and the project's own column names."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from models.errors import InputError
+from models.flight import COLUMNS
+
+OWN_NAMES = tuple(name for names, _, _ in COLUMNS.values() for name in names)
+"""Names of all columns of the project's own CSV, besides `t` and `flying`."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns (N,) of floats by name; missing values are nan. `origin` names the file in messages; row i of a
+    CSV is line i + 2 of the file (`first_line`), a Parquet row has no line."""
+
+    origin: str
+    columns: dict[str, np.ndarray]
+    notes: tuple[str, ...] = ()
+    first_line: int | None = 2
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def place(self, row: int) -> str:
+        """Where a row stands, for a message."""
+        return f"{self.origin}, " + (f"line {row + self.first_line}" if self.first_line else f"row {row + 1}")
+
+    def column(self, name: str, wanted_by: str = "") -> np.ndarray:
+        """A column by name; raises `InputError` with the nearest names where it is missing."""
+        if name in self.columns:
+            return self.columns[name]
+        close = difflib.get_close_matches(name, self.columns, 1)
+        hint = (
+            f"did you mean '{close[0]}'?" if close else f"the file has: {', '.join(list(self.columns)[:30])}"
+        )
+        raise InputError(f"{self.origin}: column '{name}'{wanted_by} is missing; {hint}")
+
+
+def read_table(path: Path) -> Table:
+    """Read a CSV or Parquet file of numbers.
+
+    Raises `InputError` for an unreadable or empty file and for a value that is not a number. A last line cut
+    short (the logger lost power) is left out with a note.
+    """
+    if path.suffix.lower() in (".parquet", ".pq"):
+        return _read_parquet(path)
+    return _read_csv(path)
+
+
+def own_columns(table: Table) -> dict[str, np.ndarray]:
+    """The groups of `models.flight.COLUMNS` that a table in the project's own format holds, by attribute.
+
+    Raises `InputError` for a group of which some columns are missing, or a file without any known column.
+    """
+    groups: dict[str, np.ndarray] = {}
+    for attribute, (names, _, what) in COLUMNS.items():
+        present = [name for name in names if name in table.columns]
+        if not present:
+            continue
+        if len(present) < len(names):
+            missing = ", ".join(f"'{name}'" for name in names if name not in present)
+            raise InputError(
+                f"{table.origin}: {missing} is missing beside {', '.join(present)} ({what}); "
+                "add it, or remove the others"
+            )
+        columns = [table.columns[name] for name in names]
+        groups[attribute] = columns[0] if len(names) == 1 else np.stack(columns, -1)
+    if not groups or "t" not in table.columns:
+        missing_name = "t" if groups else "thrust_command"
+        table.column(missing_name, " (or --mapping FILE to name your own columns)")
+    return groups
+
+
+def unknown_columns(table: Table) -> dict[str, np.ndarray]:
+    """Columns that the project has no name for. Raises `InputError` for one that looks like a misspelt
+    name."""
+    unknown = {k: v for k, v in table.columns.items() if k not in OWN_NAMES and k not in ("t", "flying")}
+    for name in unknown:
+        close = difflib.get_close_matches(name, OWN_NAMES, 1, cutoff=0.92)
+        if close and close[0] not in table.columns:
+            raise InputError(
+                f"{table.origin}: unknown column '{name}'; did you mean '{close[0]}'? Rename one or remove it"
+            )
+    return unknown
+
+
+def _read_csv(path: Path) -> Table:
+    from pyarrow import ArrowInvalid
+    from pyarrow import csv as arrow_csv
+
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the flight ({error.strerror}); check the path") from None
+    if not text.strip():
+        raise InputError(f"{path}: the file is empty; log the flight again or pass another file")
+    header = text[: text.find(b"\n")] if b"\n" in text else text
+    delimiter = ";" if header.count(b";") > header.count(b",") else ("\t" if b"\t" in header else ",")
+    notes: list[str] = []
+    body = text
+    if not text.endswith(b"\n"):
+        last = text[text.rfind(b"\n") + 1 :]
+        if last.count(delimiter.encode()) < header.count(delimiter.encode()):
+            body = text[: text.rfind(b"\n") + 1]
+            notes.append("the last line is cut short and was left out")
+    try:
+        import io
+
+        arrow = arrow_csv.read_csv(
+            io.BytesIO(body),
+            parse_options=arrow_csv.ParseOptions(delimiter=delimiter),
+            convert_options=arrow_csv.ConvertOptions(
+                null_values=["", "nan", "NaN", "NAN", "null", "-nan"], strings_can_be_null=True
+            ),
+        )
+    except (ArrowInvalid, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path}: not a table of comma-separated values: {error}; correct that line"
+        ) from None
+    return Table(str(path), _numbers(str(path), arrow, 2), tuple(notes))
+
+
+def _read_parquet(path: Path) -> Table:
+    from pyarrow import ArrowException
+    from pyarrow import parquet as arrow_parquet
+
+    try:
+        arrow = arrow_parquet.read_table(path)
+    except OSError as error:
+        reason = error.strerror or "not a whole Parquet file"
+        raise InputError(f"{path}: cannot read the flight ({reason}); check path and file") from None
+    except ArrowException as error:
+        raise InputError(f"{path}: not a whole Parquet file ({error}); export it again") from None
+    return Table(str(path), _numbers(str(path), arrow, None), (), None)
+
+
+def _numbers(origin: str, arrow: object, first_line: int | None) -> dict[str, np.ndarray]:
+    import pyarrow as pa
+
+    columns: dict[str, np.ndarray] = {}
+    for name, column in zip(arrow.column_names, arrow.columns, strict=True):  # type: ignore[attr-defined]
+        if pa.types.is_null(column.type):
+            continue
+        if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
+            _reject_text(origin, name, column.to_pylist(), first_line)
+        if not (
+            pa.types.is_integer(column.type)
+            or pa.types.is_floating(column.type)
+            or pa.types.is_boolean(column.type)
+        ):
+            continue
+        as_float = (
+            column.cast(pa.float64()) if not pa.types.is_boolean(column.type) else column.cast(pa.int8())
+        )
+        clean = name.strip().lstrip("#").strip()
+        columns[clean] = np.array(as_float.to_numpy(zero_copy_only=False), dtype=float)
+    if not columns or len(next(iter(columns.values()))) == 0:
+        raise InputError(
+            f"{origin}: no rows of numbers in it; a header line and one row for each sample are needed"
+        )
+    return columns
+
+
+def _reject_text(origin: str, name: str, values: list[str | None], first_line: int | None) -> None:
+    """Name the first value that is not a number; a column of texts only is a label and is left out."""
+    bad = []
+    for row, value in enumerate(values):
+        try:
+            float(value) if value is not None else None
+        except ValueError:
+            bad.append((row, value))
+    known = name.strip() in OWN_NAMES or name.strip() == "t"
+    if bad and (known or len(bad) < len(values) / 2):
+        row, value = bad[0]
+        place = f"line {row + first_line}" if first_line else f"row {row + 1}"
+        raise InputError(
+            f"{origin}, {place}: column '{name}' holds '{value}', which is not a number; correct it"
+        )
