@@ -1,0 +1,467 @@
+"""Which physical effect is missing from a model, from one flight and, better, a held-out one.
+
+Forward selection over the catalogue with a backward check after every step. A candidate is screened by its
+linearisation at the current optimum; the best are fitted in full, given everything already in the model. It
+stays only if it is significant under autocorrelated residuals, matters in size, predicts held-out blocks
+better and has a physically plausible value. Afterwards every effect found is exchanged for each of its
+rivals: where the exchange costs nothing, the data cannot tell them apart, and both are reported as possible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from groundstation.fitting import (
+    HAC_LAG,
+    Fit,
+    Problem,
+    block_errors,
+    fit,
+    model_of,
+)
+from groundstation.measurement import Measurement, measure
+from groundstation.remainder import Unexplained, unexplained
+from models.effect import Effect
+from models.effects import catalogue, effect_named
+from models.flight import Flight
+from models.model import Model, Term
+
+SIGNIFICANCE = 0.001
+"""Largest p-value of an effect that is called missing: a familywise 1 % over the ten or so candidates."""
+MATERIAL_SHARE = 0.01
+"""Smallest part of the remaining squared error that an effect must take away on held-out blocks."""
+MATERIAL_ACCELERATION = 0.02
+"""m/s² RMS; smaller effects are within the bias stability of a MEMS accelerometer (2 mg)."""
+SCREENED = 3
+"""Candidates fitted in full at each step."""
+MOST_EFFECTS = 6
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """A parameter with its 95 % interval."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class EffectVerdict:
+    """What the flight says about one effect of the catalogue.
+
+    `verdict` is one of missing, possible, not_supported, not_excited, included. `variance_share` is the part
+    of the squared error before that the effect takes away, given the others; `p_value` robust to
+    autocorrelation.
+    """
+
+    name: str
+    verdict: str
+    rank: int | None
+    variance_share: float
+    p_value: float
+    parameters: tuple[ParameterEstimate, ...]
+    indistinguishable_from: tuple[str, ...]
+    advice: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The result of `diagnose`. RMS figures in m/s² over all axes, behind the stated bandwidth in Hz."""
+
+    flight: Flight
+    base: Model
+    model: Model
+    rms_before: float
+    rms_after: float
+    noise_floor: float
+    bandwidth: float
+    axes: tuple[int, ...]
+    validation_before: float | None
+    validation_after: float | None
+    clock_shift: float | None
+    effects: tuple[EffectVerdict, ...]
+    unexplained: Unexplained
+    left_out: dict[str, float]
+
+    def named(self, verdict: str) -> tuple[str, ...]:
+        """Names of the effects with this verdict, in order of rank."""
+        return tuple(e.name for e in self.effects if e.verdict == verdict)
+
+
+@dataclass(frozen=True)
+class _State:
+    """A fitted set of effects on the way."""
+
+    added: tuple[str, ...]
+    fit: Fit
+    cv: np.ndarray
+
+    @property
+    def cv_total(self) -> float:
+        return float(self.cv.sum())
+
+
+def diagnose(
+    flight: Flight,
+    base: Model,
+    validation: Flight | None = None,
+    bandwidth: float | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Diagnosis:
+    """Find the effects that `base` lacks on `flight`, checked on held-out blocks and on `validation`.
+
+    Raises `InputError` where the flight lacks the columns for any comparison, or is too short.
+    """
+    measurement = measure(flight, bandwidth)
+    held_out = None if validation is None else measure(validation, bandwidth)
+    search = _Search(Problem((measurement,), base.effects_directory), base, held_out, progress)
+    return search.run()
+
+
+class _Search:
+    """One diagnosis: fits are kept by their set of effects, for the steps visit many sets again."""
+
+    def __init__(
+        self, problem: Problem, base: Model, held_out: Measurement | None, progress: Callable[[str], None]
+    ) -> None:
+        self.problem, self.base, self.progress = problem, base, progress
+        self.held_out = None if held_out is None else Problem((held_out,), base.effects_directory)
+        self.blocks = problem.blocks()
+        self.known = catalogue(base.effects_directory)
+        self.candidates = [n for n in self.known if n not in base.names() and self._measurable(self.known[n])]
+        self.samples = problem.measured().size
+        self._states: dict[frozenset[str], _State] = {}
+
+    def _measurable(self, effect: Effect) -> bool:
+        flight = self.problem.measurements[0].flight
+        if effect.name == "accelerometer_bias" and flight.specific_force is None:
+            return False
+        needs = [n for n in effect.needs if n != "specific_force"]
+        return bool(effect.parameters) and flight.has(*needs)
+
+    def state(self, added: Sequence[str]) -> _State:
+        """The base model with `added`, all of `added` fitted."""
+        key = frozenset(added)
+        if key not in self._states:
+            terms = [*self.base.terms, *(Term(n, {}) for n in added)]
+            fitted = fit(self.problem, terms, refit=list(added))
+            self._states[key] = _State(tuple(added), fitted, block_errors(fitted, self.blocks))
+        return self._states[key]
+
+    # --- the steps
+    # -------------------------------------------------------------------------------------------
+
+    def run(self) -> Diagnosis:
+        """Select, exchange, judge."""
+        current = self.state(())
+        while len(current.added) < MOST_EFFECTS:
+            self.progress(f"{len(current.added)} effects found, looking for the next")
+            following = self._forward(current)
+            if following is None:
+                break
+            following = self._backward(following)
+            if set(following.added) == set(current.added):
+                break
+            current = following
+        current = self._agrees_with_held_out(current)
+        return self._report(current)
+
+    def _steps(self, current: _State) -> list[tuple[str, ...]]:
+        """What may be added at once: one effect, or two where the one acts only through the other."""
+        present = {*self.base.names(), *current.added}
+        steps: list[tuple[str, ...]] = []
+        for name in self.candidates:
+            if name in present:
+                continue
+            needed = self.known[name].with_any
+            if not needed or present & set(needed):
+                steps.append((name,))
+            else:
+                steps += [(through, name) for through in needed if through in self.candidates]
+        return steps
+
+    def _forward(self, current: _State) -> _State | None:
+        scored = []
+        for step in self._steps(current):
+            scored.append((self._screen(current, step), step))
+        scored.sort(reverse=True)
+        best: _State | None = None
+        for _, step in scored[:SCREENED]:
+            candidate = self.state((*current.added, *step))
+            if not self._acceptable(candidate, current, step):
+                continue
+            if best is None or self._score(candidate) < self._score(best):
+                best = candidate
+        return best
+
+    def _score(self, state: _State) -> float:
+        """Held-out error with a small price on every further effect, so that of two equal models the smaller
+        wins."""
+        return state.cv_total * (1.0 + MATERIAL_SHARE) ** len(state.added)
+
+    def _screen(self, current: _State, step: tuple[str, ...]) -> float:
+        """Reduction of the squared error by the step, linearised at the current optimum and at its typical
+        size."""
+        values = {t.effect: dict(t.values) for t in current.fit.terms}
+        vehicle = self.problem.vehicle
+        here = -current.fit.residual + 0.0
+        chain = [(effect_named(n, self.base.effects_directory), v) for n, v in values.items()]
+        base = self.problem.measured() + here
+        columns = []
+        for name in step:
+            effect = self.known[name]
+            neutral = dict(values.get(name, effect.neutral(vehicle)))
+            rest = [(e, v) for e, v in chain if e.name != name]
+            for p in effect.parameters:
+                moved = {**neutral, p.name: p.typical if p.typical != neutral[p.name] else p.typical * 1.5}
+                prediction = self.problem.predict([*rest, (effect, moved)])
+                columns.append((prediction - base).ravel())
+            chain = [*rest, (effect, {p.name: p.typical for p in effect.parameters})]
+            base = self.problem.predict(chain) if len(step) > 1 else base
+        matrix = np.column_stack([current.fit.jacobian.reshape(self.samples, -1), *columns])
+        residual = current.fit.residual.ravel()
+        solution = np.linalg.lstsq(matrix.T @ matrix + 1e-9 * np.eye(matrix.shape[1]), matrix.T @ residual,
+        rcond=None)[0] return float(residual @ matrix @ solution)
+
+    def _gain(self, with_: _State, without: _State) -> float:
+        """Part of the remaining squared error on held-out blocks that `with_` takes away."""
+        return (without.cv_total - with_.cv_total) / with_.cv_total
+
+    def _acceptable(self, candidate: _State, current: _State, step: tuple[str, ...]) -> bool:
+        gain = self._gain(candidate, current)
+        size = np.sqrt(max(current.cv_total - candidate.cv_total, 0.0) / len(self.problem.measured()))
+        return (
+            gain > MATERIAL_SHARE * len(step)
+            and size > MATERIAL_ACCELERATION
+            and all(candidate.fit.wald(n) < SIGNIFICANCE for n in step)
+            and all(self._plausible(candidate.fit, n) for n in candidate.added)
+        )
+
+    def _plausible(self, fitted: Fit, name: str) -> bool:
+        """Whether each parameter's interval reaches into its physical range."""
+        for i in fitted.of(name):
+            low, high = fitted.interval(i)
+            p = fitted.free[i].parameter
+            if high < p.low or low > p.high or fitted.estimate[i] > p.high + 1e-9:
+                return False
+        return True
+
+    def _backward(self, current: _State) -> _State:
+        """Drop what the others have made superfluous, the least useful first."""
+        while True:
+            weakest = None
+            for name in current.added:
+                without = self._without(current, name)
+                if without is None:
+                    continue
+                useful = (
+                    self._gain(current, without) > MATERIAL_SHARE
+                    and current.fit.wald(name) < SIGNIFICANCE
+                    and self._plausible(current.fit, name)
+                )
+                if not useful and (weakest is None or without.cv_total < weakest.cv_total):
+                    weakest = without
+            if weakest is None:
+                return current
+            current = weakest
+
+    def _without(self, current: _State, name: str) -> _State | None:
+        rest = tuple(n for n in current.added if n != name)
+        present = {*self.base.names(), *rest}
+        if any(self.known[n].with_any and not present & set(self.known[n].with_any) for n in rest):
+            return None
+        return self.state(rest)
+
+    def _agrees_with_held_out(self, current: _State) -> _State:
+        """Drop effects that predict the held-out flight worse than the model without them."""
+        if self.held_out is None:
+            return current
+        while current.added:
+            here = self._held_out_error(current)
+            assert here is not None
+            worse = []
+            for name in current.added:
+                without = self._without(current, name)
+                if without is not None:
+                    error = self._held_out_error(without)
+                    assert error is not None
+                    if error < here * (1.0 - MATERIAL_SHARE):
+                        worse.append((error, without))
+            if not worse:
+                break
+            current = min(worse, key=lambda w: w[0])[1]
+        return current
+
+    def _held_out_error(self, state: _State) -> float | None:
+        """Squared error on the held-out flight."""
+        if self.held_out is None:
+            return None
+        chain = [(effect_named(t.effect, self.base.effects_directory), t.values) for t in state.fit.terms]
+        return float(np.sum((self.held_out.measured() - self.held_out.predict(chain)) ** 2))
+
+    # --- the verdicts
+    # ----------------------------------------------------------------------------------------
+
+    def _rivals(self, current: _State, name: str) -> tuple[str, ...]:
+        """Effects that could stand in for `name` at no cost."""
+        rest = [n for n in current.added if n != name]
+        present = {*self.base.names(), *rest}
+        found = []
+        for rival in self.candidates:
+            needed = self.known[rival].with_any
+            if rival in current.added or (needed and not present & set(needed)):
+                continue
+            if any(self.known[n].with_any and not {*present, rival} & set(self.known[n].with_any) for n in
+            rest):
+                continue
+            other = self.state((*rest, rival))
+            if not self._plausible(other.fit, rival) or other.fit.wald(rival) > SIGNIFICANCE:
+                continue
+            difference = np.sum(other.fit.residual**2, axis=1) - np.sum(current.fit.residual**2, axis=1)
+            cost = difference.sum() / current.fit.sse
+            if cost < MATERIAL_SHARE or (cost < 5 * MATERIAL_SHARE and self._z(difference) < 2.0):
+                found.append(rival)
+        return tuple(found)
+
+    def _z(self, difference: np.ndarray) -> float:
+        """Vuong's statistic of a difference of squared errors, with a Newey-West deviation (Vuong 1989)."""
+        m = self.problem.measurements[0]
+        placed = np.zeros(len(m.t))
+        placed[m.used] = difference - difference.mean()
+        lag = max(1, round(HAC_LAG / float(np.median(np.diff(m.t)))))
+        sums = np.convolve(placed, np.ones(lag), mode="full")
+        variance = float(np.sum(sums**2)) / lag
+        return float(difference.sum() / np.sqrt(variance)) if variance > 0 else 0.0
+
+    def _report(self, current: _State) -> Diagnosis:
+        before = self._before()
+        verdicts = [EffectVerdict(n, "included", None, 0.0, 0.0, (), (), "") for n in self.base.names()]
+        rivals = {n: self._rivals(current, n) for n in current.added}
+        found = []
+        for name in current.added:
+            without = self._without(current, name)
+            sse = before * self.samples if without is None else without.fit.sse
+            share = (sse - current.fit.sse) / (before * self.samples)
+            found.append((share, name))
+        found.sort(reverse=True)
+        for rank, (share, name) in enumerate(found, 1):
+            effect, same = self.known[name], rivals[name]
+            verdicts.append(
+                EffectVerdict(
+                    name,
+                    "possible" if same else "missing",
+                    rank,
+                    float(np.clip(share, 0.0, 1.0)),
+                    current.fit.wald(name),
+                    self._estimates(current.fit, name),
+                    (*same, *effect.aliases),
+                    f"fly this to tell it from {', '.join(same)}: {effect.manoeuvre}" if same else
+                    _add(effect),
+                )
+            )
+        standing_in = {r: [n for n in current.added if r in rivals[n]] for r in self.candidates}
+        rest = [self._judge_absent(current, n, standing_in[n]) for n in self.candidates if n not in
+        current.added] verdicts += sorted(rest, key=lambda v: (v.verdict != "possible", v.p_value))
+        for name, effect in self.known.items():
+            if name not in self.candidates and name not in self.base.names():
+                verdicts.append(self._judge_unmeasured(effect))
+        validation_after = self._held_out_error(current)
+        held_samples = 0 if self.held_out is None else self.held_out.measured().size
+        m = self.problem.measurements[0]
+        axes = list(m.axes)
+        shift = [float(current.fit.estimate[i]) for i, f in enumerate(current.fit.free) if f.nuisance]
+        final = model_of(current.fit, self.base)
+        return Diagnosis(
+            flight=m.flight,
+            base=self.base,
+            model=final,
+            rms_before=float(np.sqrt(before)),
+            rms_after=float(np.sqrt(current.fit.sse / self.samples)),
+            noise_floor=float(np.sqrt(np.mean(m.noise[axes] ** 2))),
+            bandwidth=m.bandwidth,
+            axes=m.axes,
+            validation_before=None if self.held_out is None else float(np.sqrt(self._before(self.held_out))),
+            validation_after=None if validation_after is None else float(np.sqrt(validation_after /
+            held_samples)), clock_shift=shift[0] - self.problem.vehicle.command_delay if shift else None,
+            effects=tuple(verdicts),
+            unexplained=unexplained(m, current.fit.residual),
+            left_out=m.left_out,
+        )
+
+    def _before(self, problem: Problem | None = None) -> float:
+        """Mean squared error of the base model as it stands, nothing refitted."""
+        problem = problem or self.problem
+        return float(np.mean((problem.measured() - problem.predict(self.base.chain())) ** 2))
+
+    def _estimates(self, fitted: Fit, name: str) -> tuple[ParameterEstimate, ...]:
+        return tuple(
+            ParameterEstimate(
+                fitted.free[i].parameter.name,
+                float(fitted.estimate[i]),
+                *fitted.interval(i),
+                fitted.free[i].parameter.unit,
+            )
+            for i in fitted.of(name)
+        )
+
+    def _judge_absent(self, current: _State, name: str, stands_for: list[str]) -> EffectVerdict:
+        """The verdict on an effect that was not selected."""
+        effect = self.known[name]
+        present = {*self.base.names(), *current.added}
+        if effect.with_any and not present & set(effect.with_any):
+            through = next((n for n in effect.with_any if n in self.candidates), None)
+            if through is None:
+                return self._judge_unmeasured(effect)
+            extended = self.state((*current.added, through, name))
+        else:
+            extended = self.state((*current.added, name))
+        share = (current.fit.sse - extended.fit.sse) / (self._before() * self.samples)
+        p = extended.fit.wald(name)
+        estimates = self._estimates(extended.fit, name)
+        if stands_for:
+            # as a stand-in for the effect found, not beside it
+            swapped = self.state(tuple(name if n == stands_for[0] else n for n in current.added))
+            estimates = self._estimates(swapped.fit, name)
+            advice = f"fly this to tell it from {', '.join(stands_for)}: {effect.manoeuvre}"
+            return EffectVerdict(name, "possible", None, share, p, estimates, tuple(stands_for), advice)
+        if not self._excited(extended, current, name):
+            advice = f"fly this, then ask again: {effect.manoeuvre}"
+            return EffectVerdict(name, "not_excited", None, share, p, estimates, (), advice)
+        return EffectVerdict(name, "not_supported", None, share, p, estimates, (), "")
+
+    def _excited(self, extended: _State, current: _State, name: str) -> bool:
+        """Whether this flight would have shown the effect at its typical size."""
+        fitted, vehicle = extended.fit, self.problem.vehicle
+        columns = fitted.of(name)
+        offset = np.array(
+            [fitted.free[i].parameter.typical - fitted.free[i].parameter.neutral_for(vehicle) for i in
+            columns]
+        )
+        covariance = fitted.covariance[np.ix_(columns, columns)]
+        noncentrality = float(offset @ np.linalg.pinv(covariance, hermitian=True) @ offset)
+        contribution = fitted.jacobian[:, :, columns] @ offset
+        material = np.sqrt(np.mean(np.sum(contribution**2, axis=1))) > MATERIAL_ACCELERATION
+        threshold = stats.chi2.isf(SIGNIFICANCE, len(columns)) * (fitted.critical / 1.96) ** 2
+        power = stats.ncx2.sf(threshold, len(columns), noncentrality)
+        share = float(np.sum(contribution**2)) / current.fit.sse
+        return bool(material and power > 0.8 and share > MATERIAL_SHARE)
+
+    def _judge_unmeasured(self, effect: Effect) -> EffectVerdict:
+        """The verdict on an effect whose measurements the flight lacks."""
+        flight = self.problem.measurements[0].flight
+        missing = [n for n in effect.needs if not flight.has(n)]
+        through = f" and one of {', '.join(effect.with_any)} in the model" if effect.with_any else ""
+        advice = f"needs {', '.join(missing) or 'measurements'}{through}; record it, then: {effect.manoeuvre}"
+        return EffectVerdict(effect.name, "not_excited", None, 0.0, 1.0, (), (), advice)
+
+
+def _add(effect: Effect) -> str:
+    alias = f" (these data cannot tell it from {', '.join(effect.aliases)})" if effect.aliases else ""
+    return f"add it: groundstation model add {effect.name}{alias}"

@@ -1,0 +1,281 @@
+"""Fitting the parameters of a chain of effects to flights, with intervals that hold under correlated residuals.
+
+Least squares on specific force, body axes, every axis with the same weight. Residuals of flight data at 100 Hz are
+strongly autocorrelated, so ordinary intervals would be far too narrow: covariances here are Newey-West with a
+Bartlett kernel of `HAC_LAG` s, and critical values are the fixed-b ones of Kiefer and Vogelsang (2005), "A new
+asymptotic theory for heteroskedasticity-autocorrelation robust tests", Econometric Theory 21, table 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize, stats
+from statsmodels.stats.sandwich_covariance import S_hac_simple
+
+from groundstation.measurement import Measurement
+from models.effect import Effect, Parameter, Stage
+from models.effects import effect_named
+from models.model import Model, Term
+from models.prediction import act, motion_of_flight, specific_force
+from models.vehicle import Vehicle
+
+HAC_LAG = 2.0
+"""s of Bartlett kernel: beyond the slowest correlation that a position-controlled quadrotor shows."""
+BLOCK = 5.0
+"""s of each held-out block."""
+
+
+@dataclass(frozen=True)
+class Free:
+    """One free number of a fit: a parameter of an effect, its start and its bounds."""
+
+    effect: str
+    parameter: Parameter
+    start: float
+    low: float
+    high: float
+    nuisance: bool = False
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Measured flights and, for each, the motion that effects act on."""
+
+    measurements: tuple[Measurement, ...]
+    effects_directory: str | None = None
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle of the flights."""
+        return self.measurements[0].flight.vehicle
+
+    def predict(self, chain: Sequence[tuple[Effect, Mapping[str, float]]]) -> np.ndarray:
+        """Predicted specific force (K, A) of the used samples of all flights, behind each flight's filter."""
+        parts = []
+        for m in self.measurements:
+            force = m.see(specific_force(act(motion_of_flight(m.flight), chain)))
+            parts.append(force[m.used][:, m.axes])
+        return np.concatenate(parts)
+
+    def measured(self) -> np.ndarray:
+        """Measured specific force (K, A) of the used samples."""
+        return np.concatenate([m.value[m.used][:, m.axes] for m in self.measurements])
+
+    def blocks(self) -> np.ndarray:
+        """Number of the held-out block of each used sample (K,)."""
+        numbers, offset = [], 0
+        for m in self.measurements:
+            block = ((m.t[m.used] - m.t[0]) / BLOCK).astype(int)
+            _, block = np.unique(block, return_inverse=True)
+            numbers.append(block + offset)
+            offset += int(block.max()) + 1
+        return np.concatenate(numbers)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted chain.
+
+    `values` by effect and parameter; `free` the P fitted numbers, `estimate` (P,) theirs, `covariance` (P, P);
+    `jacobian` (K, A, P) and `residual` (K, A) at the optimum; `critical` the two-sided 95 % factor of `covariance`.
+    """
+
+    terms: tuple[Term, ...]
+    free: tuple[Free, ...]
+    estimate: np.ndarray
+    covariance: np.ndarray
+    critical: float
+    jacobian: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def sse(self) -> float:
+        """Sum of squared residuals, (m/s²)²."""
+        return float(np.sum(self.residual**2))
+
+    def of(self, effect: str) -> list[int]:
+        """Columns of the free numbers that belong to `effect`."""
+        return [i for i, f in enumerate(self.free) if f.effect == effect and not f.nuisance]
+
+    def interval(self, index: int) -> tuple[float, float]:
+        """95 % interval of one free number."""
+        half = self.critical * float(np.sqrt(max(self.covariance[index, index], 0.0)))
+        return float(self.estimate[index] - half), float(self.estimate[index] + half)
+
+    def wald(self, effect: str) -> float:
+        """p-value that all parameters of `effect` are neutral, from the robust covariance.
+
+        The fixed-b factor of one number is applied to the statistic as a whole.
+        """
+        columns = self.of(effect)
+        if not columns:
+            return 1.0
+        neutral = np.array([f.start if f.nuisance else _neutral(f) for f in (self.free[i] for i in columns)])
+        difference = self.estimate[columns] - neutral
+        covariance = self.covariance[np.ix_(columns, columns)]
+        statistic = float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
+        return float(stats.chi2.sf(statistic * (1.96 / self.critical) ** 2, len(columns)))
+
+
+def _neutral(free: Free) -> float:
+    return free.parameter.neutral if isinstance(free.parameter.neutral, float) else free.start
+
+
+def critical_value(duration: float) -> float:
+    """Two-sided 95 % factor for a Bartlett kernel of `HAC_LAG` over `duration` s (Kiefer & Vogelsang 2005)."""
+    b = min(1.0, HAC_LAG / max(duration, HAC_LAG))
+    return 1.9600 + 2.9694 * b + 0.4160 * b**2 - 0.5324 * b**3
+
+
+def free_parameters(effect: Effect, vehicle: Vehicle, start: Mapping[str, float] | None = None) -> list[Free]:
+    """The numbers of `effect` to fit. Bounds reach a little beyond the plausible range, so that data may contradict
+    the effect instead of resting on its bound."""
+    free = []
+    for p in effect.parameters:
+        neutral = p.neutral_for(vehicle)
+        margin = 0.0 if effect.stage is Stage.COMMAND or effect.name == "ground_effect" else 2.0 * abs(p.typical - neutral)
+        value = (start or {}).get(p.name, neutral + 0.3 * (p.typical - neutral))
+        low, high = p.low - margin, p.high + margin
+        free.append(Free(effect.name, p, float(np.clip(value, low + 1e-9, high - 1e-9)), low, high))
+    return free
+
+
+def fit(
+    problem: Problem,
+    terms: Sequence[Term],
+    refit: Sequence[str] | None = None,
+    clock: bool = True,
+    tolerance: float = 1e-6,
+) -> Fit:
+    """Fit the parameters of `terms` (all of them, or the effects named in `refit`) to the flights.
+
+    With `clock`, the delay between the columns is free within one sample of what the vehicle file says: no log's
+    clock is better than that, and a shift must not be taken for drag.
+    """
+    vehicle, names = problem.vehicle, [t.effect for t in terms]
+    fixed = {t.effect: dict(t.values) for t in terms}
+    free: list[Free] = []
+    for term in terms:
+        if refit is None or term.effect in refit:
+            free += free_parameters(effect_named(term.effect, problem.effects_directory), vehicle, term.values or None)
+    chain_names = list(names)
+    if clock and "transport_delay" not in names:
+        period = max(m.flight.dt for m in problem.measurements)
+        delay = effect_named("transport_delay").parameters[0]
+        low = max(0.0, vehicle.command_delay - period)
+        free.append(
+            Free("transport_delay", delay, vehicle.command_delay, low, vehicle.command_delay + period, nuisance=True)
+        )
+        chain_names.append("transport_delay")
+    effects = [effect_named(n, problem.effects_directory) for n in chain_names]
+    measured = problem.measured()
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        values = {name: dict(fixed.get(name, {})) for name in chain_names}
+        for f, value in zip(free, x, strict=True):
+            values[f.effect][f.parameter.name] = float(value)
+        return (measured - problem.predict([(e, values[e.name]) for e in effects])).ravel()
+
+    scale = np.array([max(abs(f.parameter.typical - _typical_base(f, vehicle)), 1e-6) for f in free])
+    if free:
+        solution = optimize.least_squares(
+            residual,
+            np.array([f.start for f in free]),
+            jac=lambda x: _jacobian(residual, x, free, scale),
+            bounds=([f.low for f in free], [max(f.high, f.low + 1e-9) for f in free]),
+            x_scale=scale,
+            ftol=tolerance,
+            xtol=1e-5,
+            gtol=1e-12,
+            max_nfev=25,
+        )
+        estimate, flat, jacobian = solution.x, solution.fun, solution.jac
+    else:
+        estimate, flat, jacobian = np.zeros(0), residual(np.zeros(0)), np.zeros((measured.size, 0))
+    k, a = measured.shape
+    shaped = jacobian.reshape(k, a, len(free))
+    covariance, critical = robust_covariance(problem, shaped, flat.reshape(k, a))
+    values = {name: dict(fixed.get(name, {})) for name in chain_names}
+    intervals: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in chain_names}
+    for i, f in enumerate(free):
+        half = critical * float(np.sqrt(max(covariance[i, i], 0.0)))
+        values[f.effect][f.parameter.name] = float(estimate[i])
+        intervals[f.effect][f.parameter.name] = (float(estimate[i] - half), float(estimate[i] + half))
+    fitted = tuple(
+        Term(name, values[name], intervals[name] or (terms[i].intervals if i < len(terms) else {}))
+        for i, name in enumerate(chain_names)
+    )
+    return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a))
+
+
+def _typical_base(free: Free, vehicle: Vehicle) -> float:
+    return free.parameter.neutral_for(vehicle)
+
+
+def _jacobian(residual: object, x: np.ndarray, free: Sequence[Free], scale: np.ndarray) -> np.ndarray:
+    """Forward differences with steps of a hundredth of each parameter's typical size, away from its upper bound."""
+    base = residual(x)  # type: ignore[operator]
+    columns = np.empty((base.size, len(x)))
+    for i, f in enumerate(free):
+        step = 0.02 * scale[i]
+        if x[i] + step > f.high:
+            step = -step
+        moved = x.copy()
+        moved[i] += step
+        columns[:, i] = (residual(moved) - base) / step  # type: ignore[operator]
+    return columns
+
+
+def robust_covariance(problem: Problem, jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, float]:
+    """Newey-West sandwich covariance (P, P) of least squares with `jacobian` (K, A, P) and `residual` (K, A), and
+    its fixed-b factor for 95 %."""
+    k, a, p = jacobian.shape
+    flat = jacobian.reshape(k * a, p)
+    bread = np.linalg.pinv(flat.T @ flat, hermitian=True)
+    scores = np.einsum("kap,ka->kp", jacobian, residual)
+    meat, offset, seconds = np.zeros((p, p)), 0, 0.0
+    for m in problem.measurements:
+        # the samples in their places in time, with zeros for those left out, so that lags are lags
+        placed = np.zeros((len(m.t), p))
+        placed[m.used] = scores[offset : offset + int(m.used.sum())]
+        period = float(np.median(np.diff(m.t)))
+        if p:
+            meat += S_hac_simple(placed, nlags=max(1, round(HAC_LAG / period)))
+        offset += int(m.used.sum())
+        seconds += float(m.used.sum()) * period
+    covariance = bread @ meat @ bread * (k / max(k - p, 1))
+    return covariance, critical_value(seconds)
+
+
+def block_errors(fit_: Fit, blocks: np.ndarray) -> np.ndarray:
+    """Sum of squared residuals of each block (B,), predicted by parameters fitted without that block.
+
+    One Gauss-Newton step from the common optimum, exact for effects that are linear in their parameters.
+    """
+    count = int(blocks.max()) + 1
+    _k, _a, p = fit_.jacobian.shape
+    augmented = np.concatenate([fit_.jacobian, fit_.residual[:, :, None]], axis=2)
+    gram = np.zeros((count, p + 1, p + 1))
+    for b in range(count):
+        part = augmented[blocks == b].reshape(-1, p + 1)
+        gram[b] = part.T @ part
+    total = gram.sum(axis=0)
+    errors = np.empty(count)
+    bounds_low = np.array([f.low for f in fit_.free]) - fit_.estimate
+    bounds_high = np.array([f.high for f in fit_.free]) - fit_.estimate
+    for b in range(count):
+        rest = total - gram[b]
+        # residual(x + d) is about residual + J d
+        step = -np.linalg.lstsq(rest[:p, :p] + 1e-9 * np.diag(np.diag(rest[:p, :p]) + 1e-12), rest[:p, p], rcond=None)[0]
+        step = np.clip(step, bounds_low, bounds_high)
+        errors[b] = gram[b, p, p] + 2 * step @ gram[b, :p, p] + step @ gram[b, :p, :p] @ step
+    return errors
+
+
+def model_of(fit_: Fit, base: Model) -> Model:
+    """The base model with the fitted terms; the clock's shift, a nuisance, stays out."""
+    nuisance = {f.effect for f in fit_.free if f.nuisance}
+    return base.with_terms(tuple(t for t in fit_.terms if t.effect not in nuisance))

@@ -1,0 +1,172 @@
+"""What was measured, made comparable with what a model predicts: one filter and one mask for both sides."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage, signal
+
+from models.errors import InputError
+from models.flight import Flight
+from models.frames import rotate, rotate_inverse
+from models.vehicle import GRAVITY
+
+ACCELEROMETER_BANDWIDTH = 20.0
+"""Hz. Thrust and drag of a quadrotor live below it, most of the rotors' vibration above."""
+DIFFERENTIATED_BANDWIDTH = 5.0
+"""Hz, where acceleration comes from differentiated velocity, whose noise grows with frequency."""
+RATE_ERROR_LIMIT = 1.0
+"""rad/s between commanded and measured body rate: above it rotors are driven apart, and may saturate, to turn
+the vehicle, so that the collective command no longer tells the thrust."""
+SETTLING = 0.2
+"""s around such a moment that are left out as well."""
+SHORTEST = 5.0
+"""s of flight below which nothing is fitted."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The measured side of a flight, ready to be compared.
+
+    `value` (M, 3) is specific force in body axes, m/s², low-passed at `bandwidth` Hz and thinned to the rows
+    `rows` of the flight; `used` (M,) marks the ones that count; `t` (M,) in s; `see` passes a predicted
+    specific force (N, 3) through the same filter and thinning; `noise` (3,) is the RMS that sensor noise
+    alone leaves; `axes` the body axes that the flight measures.
+    """
+
+    flight: Flight
+    t: np.ndarray
+    rows: np.ndarray
+    value: np.ndarray
+    used: np.ndarray
+    see: Callable[[np.ndarray], np.ndarray]
+    bandwidth: float
+    noise: np.ndarray
+    axes: tuple[int, ...]
+    left_out: dict[str, float]
+
+
+def measure(flight: Flight, bandwidth: float | None = None) -> Measurement:
+    """The measured specific force of `flight`, from its accelerometer or else from its velocity.
+
+    Raises `InputError` where the flight has neither, or is too short.
+    """
+    fs = 1.0 / flight.dt
+    if flight.duration < SHORTEST:
+        raise InputError(
+            f"{flight.origin or flight.name}: {flight.duration:.1f} s of flight are too short; give "
+            f"{SHORTEST:g} s or more"
+        )
+    if flight.specific_force is not None:
+        raw, differentiate, default = flight.specific_force, False, ACCELEROMETER_BANDWIDTH
+    elif flight.velocity is not None and flight.quaternion is not None:
+        raw, differentiate, default = flight.velocity, True, DIFFERENTIATED_BANDWIDTH
+    else:
+        raise InputError(
+            f"{flight.origin or flight.name}: neither an accelerometer nor velocity and attitude; add "
+            "specific_force_x, _y, _z "
+            "or velocity_* and quaternion_* (map yours with --mapping)"
+        )
+    bandwidth = min(bandwidth or default, 0.4 * fs)
+    sos = signal.butter(4, bandwidth, fs=fs, output="sos")
+    step = max(1, int(fs / (2.5 * bandwidth)))
+    rows = np.arange(0, len(flight), step)
+    pieces = _pieces(flight)
+
+    def low_pass(x: np.ndarray) -> np.ndarray:
+        out = np.empty_like(x)
+        for piece in pieces:
+            out[piece] = signal.sosfiltfilt(sos, x[piece], axis=0, padlen=min(len(x[piece]) - 1, int(fs)))
+        return out
+
+    if differentiate:
+        quaternion = flight.quaternion[rows]  # type: ignore[index]
+
+        def slope(v: np.ndarray) -> np.ndarray:
+            out = np.empty_like(v)
+            for piece in pieces:
+                out[piece] = np.gradient(v[piece], flight.dt, axis=0)
+            return out
+
+        def see(force: np.ndarray) -> np.ndarray:
+            world = rotate(flight.quaternion, force)  # type: ignore[arg-type]
+            # a central difference averages acceleration over two periods: so does the model's side
+            for piece in pieces:
+                world[piece] = ndimage.correlate1d(world[piece], [0.25, 0.5, 0.25], axis=0, mode="nearest")
+            return rotate_inverse(quaternion, low_pass(world)[rows])
+
+        value = rotate_inverse(quaternion, ([*low_pass(slope(raw)), 0.0, 0.0, GRAVITY])[rows])
+    else:
+
+        def see(force: np.ndarray) -> np.ndarray:
+            return low_pass(force)[rows]
+
+        value = see(raw)
+    used, left_out = _used(flight, bandwidth)
+    return Measurement(
+        flight=flight,
+        t=flight.t[rows],
+        rows=rows,
+        value=value,
+        used=used[rows],
+        see=see,
+        bandwidth=bandwidth,
+        noise=_noise(raw, used, sos, fs, differentiate),
+        axes=(0, 1, 2) if flight.quaternion is not None else (2,),
+        left_out=left_out,
+    )
+
+
+def _pieces(flight: Flight) -> list[slice]:
+    """Stretches without a gap in time: filters must not reach across one."""
+    breaks = np.flatnonzero(np.diff(flight.t) > 3.0 * flight.dt) + 1
+    edges = [0, *breaks.tolist(), len(flight)]
+    return [slice(a, b) for a, b in itertools.pairwise(edges) if b - a > 1]
+
+
+def _used(flight: Flight, bandwidth: float) -> tuple[np.ndarray, dict[str, float]]:
+    """Mask (N,) of the samples at which the collective command is believed to tell the thrust, and what went
+    out."""
+    n = len(flight)
+    used = np.ones(n, dtype=bool) if flight.flying is None else flight.flying.copy()
+    left_out = {"not flying": 1.0 - float(used.mean())}
+    settling = max(1, int(SETTLING / flight.dt))
+    command = flight.column("thrust_command")
+    at_limit = (command <= max(0.05, 0.02 * flight.vehicle.hover_thrust)) | (command >= 0.97)
+    out = ndimage.binary_dilation(at_limit, iterations=settling)
+    left_out["thrust at its limit"] = float((out & used).mean())
+    used &= ~out
+    if flight.has("angular_velocity", "body_rate_command"):
+        # type: ignore[operator]
+        error = np.abs(flight.body_rate_command - flight.angular_velocity).max(axis=1)
+        out = ndimage.binary_dilation(error > RATE_ERROR_LIMIT, iterations=settling)
+        left_out["turning harder than commanded rates follow"] = float((out & used).mean())
+        used &= ~out
+    edge = max(2, int(0.5 / bandwidth / flight.dt))
+    for piece in _pieces(flight):
+        used[piece.start : piece.start + edge] = False
+        used[max(piece.stop - edge, piece.start) : piece.stop] = False
+    if used.sum() * flight.dt < SHORTEST:
+        reasons = ", ".join(f"{v:.0%} {k}" for k, v in left_out.items() if v > 0.005)
+        raise InputError(
+            f"{flight.origin or flight.name}: only {used.sum() * flight.dt:.1f} s of the flight can be "
+            "compared "
+            f"({reasons or 'too few samples'}); give a longer or calmer flight"
+        )
+    return used, left_out
+
+
+def _noise(raw: np.ndarray, used: np.ndarray, sos: np.ndarray, fs: float, differentiate: bool) -> np.ndarray:
+    """RMS (3,) of white sensor noise behind the filter, from third differences of the raw signal, which
+    motion leaves alone; the median makes it deaf to shocks."""
+    third = np.diff(raw, n=3, axis=0)[used[3:]] if used[3:].sum() > 50 else np.diff(raw, n=3, axis=0)
+    sigma = np.median(np.abs(third), axis=0) / 0.6745 / np.sqrt(20.0)
+    w, h = signal.sosfreqz(sos, worN=512, fs=fs)
+    gain = np.abs(h) ** 2  # forward and backward
+    if differentiate:
+        gain = gain * np.sin(2 * np.pi * w / fs) * fs
+    return sigma * float(np.sqrt(np.mean(gain**2)))
+
