@@ -227,8 +227,10 @@ class _Search:
             base = self.problem.predict(chain) if len(step) > 1 else base
         matrix = np.column_stack([current.fit.jacobian.reshape(self.samples, -1), *columns])
         residual = current.fit.residual.ravel()
-        solution = np.linalg.lstsq(matrix.T @ matrix + 1e-9 * np.eye(matrix.shape[1]), matrix.T @ residual,
-        rcond=None)[0] return float(residual @ matrix @ solution)
+        solution = np.linalg.lstsq(
+            matrix.T @ matrix + 1e-9 * np.eye(matrix.shape[1]), matrix.T @ residual, rcond=None
+        )[0]
+        return float(residual @ matrix @ solution)
 
     def _gain(self, with_: _State, without: _State) -> float:
         """Part of the remaining squared error on held-out blocks that `with_` takes away."""
@@ -367,8 +369,10 @@ class _Search:
                 )
             )
         standing_in = {r: [n for n in current.added if r in rivals[n]] for r in self.candidates}
-        rest = [self._judge_absent(current, n, standing_in[n]) for n in self.candidates if n not in
-        current.added] verdicts += sorted(rest, key=lambda v: (v.verdict != "possible", v.p_value))
+        rest = [
+            self._judge_absent(current, n, standing_in[n]) for n in self.candidates if n not in current.added
+        ]
+        verdicts += sorted(rest, key=lambda v: (v.verdict != "possible", v.p_value))
         for name, effect in self.known.items():
             if name not in self.candidates and name not in self.base.names():
                 verdicts.append(self._judge_unmeasured(effect))

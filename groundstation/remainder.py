@@ -36,10 +36,13 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
     linear = np.column_stack(variables)
     scale = linear.std(axis=0)
     keep = scale > 1e-6
-    names, linear = [n for n, k in zip(names, keep, strict=True) if k], (linear[:, keep] - linear[:,
-    keep].mean(0)) / scale[keep] i, j = np.triu_indices(linear.shape[1])
-    features = np.clip(np.column_stack([np.ones(len(linear)), linear, linear[:, i] * linear[:, j]]), -9.0,
-    9.0) owners = [None, *[(k, k) for k in range(linear.shape[1])], *zip(i.tolist(), j.tolist(), strict=True)]
+    names = [n for n, k in zip(names, keep, strict=True) if k]
+    linear = (linear[:, keep] - linear[:, keep].mean(0)) / scale[keep]
+    i, j = np.triu_indices(linear.shape[1])
+    features = np.clip(
+        np.column_stack([np.ones(len(linear)), linear, linear[:, i] * linear[:, j]]), -9.0, 9.0
+    )
+    owners = [None, *[(k, k) for k in range(linear.shape[1])], *zip(i.tolist(), j.tolist(), strict=True)]
     block = ((measurement.t[measurement.used] - measurement.t[0]) / BLOCK).astype(int)
     total = float(np.sum(residual**2))
     explained = total - _held_out_error(features, residual, block)
