@@ -155,8 +155,7 @@ class _Search:
             self._states[key] = _State(tuple(added), fitted, block_errors(fitted, self.blocks))
         return self._states[key]
 
-    # --- the steps
-    # -------------------------------------------------------------------------------------------
+    # --- the steps ------------------------------------------------------------------------------------------
 
     def run(self) -> Diagnosis:
         """Select, exchange, judge."""
@@ -308,8 +307,7 @@ class _Search:
         chain = [(effect_named(t.effect, self.base.effects_directory), t.values) for t in state.fit.terms]
         return float(np.sum((self.held_out.measured() - self.held_out.predict(chain)) ** 2))
 
-    # --- the verdicts
-    # ----------------------------------------------------------------------------------------
+    # --- the verdicts ---------------------------------------------------------------------------------------
 
     def _rivals(self, current: _State, name: str) -> tuple[str, ...]:
         """Effects that could stand in for `name` at no cost."""
