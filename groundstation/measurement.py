@@ -49,8 +49,10 @@ class Measurement:
     left_out: dict[str, float]
 
 
-def measure(flight: Flight, bandwidth: float | None = None) -> Measurement:
+def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -> Measurement:
     """The measured specific force of `flight`, from its accelerometer or else from its velocity.
+
+    `thin` keeps no more rows than the bandwidth needs.
 
     Raises `InputError` where the flight has neither, or is too short.
     """
@@ -72,7 +74,7 @@ def measure(flight: Flight, bandwidth: float | None = None) -> Measurement:
         )
     bandwidth = min(bandwidth or default, 0.4 * fs)
     sos = signal.butter(4, bandwidth, fs=fs, output="sos")
-    step = max(1, int(fs / (2.5 * bandwidth)))
+    step = max(1, int(fs / (2.5 * bandwidth))) if thin else 1
     rows = np.arange(0, len(flight), step)
     pieces = _pieces(flight)
 
@@ -140,8 +142,7 @@ def _used(flight: Flight, bandwidth: float) -> tuple[np.ndarray, dict[str, float
     left_out["thrust at its limit"] = float((out & used).mean())
     used &= ~out
     if flight.has("angular_velocity", "body_rate_command"):
-        # type: ignore[operator]
-        error = np.abs(flight.body_rate_command - flight.angular_velocity).max(axis=1)
+        error = np.abs(flight.body_rate_command - flight.angular_velocity).max(axis=1)  # type: ignore[operator]
         out = ndimage.binary_dilation(error > RATE_ERROR_LIMIT, iterations=settling)
         left_out["turning harder than commanded rates follow"] = float((out & used).mean())
         used &= ~out

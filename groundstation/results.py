@@ -87,13 +87,24 @@ class Moment:
 
 
 @dataclass(frozen=True)
+class PlaceMap:
+    """Squared residual over square cells of the ground: `centres` (C, 2) in m, world x and y; `rms` (C,) in m/s²."""
+
+    cell: float  # m
+    centres: np.ndarray
+    rms: np.ndarray
+    share_of_error: np.ndarray
+    share_of_time: np.ndarray
+
+
+@dataclass(frozen=True)
 class WhereItFails:
     """Where the residual of a comparison sits."""
 
     maps: tuple[ErrorMap, ...]
     regions: tuple[Region, ...]
     worst: tuple[Moment, ...]
-    place: ErrorMap | None = None  # over horizontal distance cells; None where the flight has no position
+    place: PlaceMap | None = None  # None where the flight has no position
 
 
 @dataclass(frozen=True)
