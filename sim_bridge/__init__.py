@@ -1,1 +1,1 @@
-"""Stands in for the vehicle: MuJoCo physics with a truth of its own, speaking MAVLink as a PX4 would."""
+"""A simulated vehicle that behaves as a PX4 would, with a truth of its own in which an effect can be hidden."""

@@ -1,0 +1,201 @@
+"""Rotors on a frame in air: from motor commands and motion to the force and torque on the body.
+
+Nominally it does what the owner of the vehicle believes: thrust follows the believed curve of the command through
+the believed first-order lag of rotor speed, whatever the battery does, and the air does nothing. Hidden effects
+change its numbers or act in `on_rotors` and `on_body`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from models.vehicle import Vehicle
+from sim_bridge.truth.battery import Battery, BatteryCell, battery_for
+
+AIR_DENSITY = 1.225
+"""kg/m³ at sea level."""
+
+_THRUST_COEFFICIENT = 0.1  # of a small fixed-pitch propeller: thrust = C_T rho n² D⁴
+_DRAG_TORQUE_PER_DIAMETER = 0.07  # drag torque over thrust and diameter, likewise typical
+_MOTOR_EFFICIENCY = 0.75
+_AVIONICS_POWER = 3.0  # W
+_DISCHARGE_STEPS = 5  # the state of charge moves in minutes; it need not be integrated at the physics rate
+
+
+@dataclass(frozen=True)
+class Powertrain:
+    """The numbers of the rotors and of what drives them. Rotors in the order of the vehicle's rotor_positions.
+
+    `thrust_constants` in N s² (thrust over rotor speed squared), `torque_per_thrust` in m, `hover_speed` in rad/s.
+    `speed_blend` is the share of the other curve in the map from command to rotor speed (0: as believed).
+    `time_constant` of rotor speed and `delay` from setpoint to motors in s.
+    """
+
+    thrust_constants: tuple[float, float, float, float]
+    torque_per_thrust: float
+    hover_speed: float
+    hover_command: float
+    linear: bool
+    speed_blend: float
+    time_constant: float
+    delay: float
+    battery: BatteryCell
+
+
+def believed_powertrain(vehicle: Vehicle) -> Powertrain:
+    """A powertrain that agrees with the vehicle file."""
+    share = vehicle.weight / 4
+    diameter = 2 * vehicle.rotor_radius
+    turns = math.sqrt(share / (_THRUST_COEFFICIENT * AIR_DENSITY * diameter**4))
+    speed = 2 * math.pi * turns
+    torque_per_thrust = _DRAG_TORQUE_PER_DIAMETER * diameter
+    power = 4 * torque_per_thrust * share * speed / _MOTOR_EFFICIENCY + _AVIONICS_POWER
+    constant = share / speed**2
+    return Powertrain(
+        thrust_constants=(constant, constant, constant, constant),
+        torque_per_thrust=torque_per_thrust,
+        hover_speed=speed,
+        hover_command=vehicle.hover_thrust,
+        linear=vehicle.thrust_model == "linear",
+        speed_blend=0.0,
+        time_constant=vehicle.motor_time_constant,
+        delay=vehicle.command_delay,
+        battery=battery_for(vehicle, power),
+    )
+
+
+class Motion:
+    """What the air and the rotors meet, one step at a time; every number a plain float.
+
+    `x, y, z` m in the world; `r00..r22` the rotation body to world; `vx, vy, vz` m/s in the world; `u, v, w` the
+    velocity through the air in the body, m/s; `p, q, r` body rates, rad/s; `speeds` rad/s and `thrusts` N of the
+    rotors; `wrench` the force (N) and torque (N m) in the body; `voltage` at the battery.
+    """
+
+    __slots__ = (
+        *("x", "y", "z", "vx", "vy", "vz", "u", "v", "w", "p", "q", "r"),
+        *("r00", "r01", "r02", "r10", "r11", "r12", "r20", "r21", "r22"),
+        *("speeds", "thrusts", "wrench", "voltage"),
+    )
+
+    def __init__(self) -> None:
+        self.x = self.y = self.z = self.vx = self.vy = self.vz = 0.0
+        self.u = self.v = self.w = self.p = self.q = self.r = 0.0
+        self.r00 = self.r11 = self.r22 = 1.0
+        self.r01 = self.r02 = self.r10 = self.r12 = self.r20 = self.r21 = 0.0
+        self.speeds = [0.0, 0.0, 0.0, 0.0]
+        self.thrusts = [0.0, 0.0, 0.0, 0.0]
+        self.wrench = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        self.voltage = 0.0
+
+
+Act = Callable[[Motion], None]
+
+
+class Airframe:
+    """The vehicle's rotors in air.
+
+    `on_rotors` are called after the rotors' speeds are known and may change `motion.thrusts`; `on_body` are called
+    last and add to `motion.wrench`. `wind` is the air's velocity in the world, m/s.
+    """
+
+    def __init__(self, vehicle: Vehicle, powertrain: Powertrain, dt: float) -> None:
+        self.vehicle = vehicle
+        self.powertrain = powertrain
+        self.dt = dt
+        self.motion = Motion()
+        self.battery = Battery(powertrain.battery)
+        self.motion.voltage = self.battery.load(_AVIONICS_POWER)
+        self.wind = (0.0, 0.0, 0.0)
+        self.on_rotors: list[Act] = []
+        self.on_body: list[Act] = []
+        self._arms = tuple(
+            (x, y, direction * powertrain.torque_per_thrust)
+            for (x, y, _), direction in zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True)
+        )
+        # Exact solution of the first-order lag over one step; a vehicle file may believe in no lag at all.
+        tau = powertrain.time_constant
+        self._follow = 1.0 - math.exp(-dt / tau) if tau > 0 else 1.0
+        self._power_per_speed = powertrain.torque_per_thrust / _MOTOR_EFFICIENCY
+        self._steps_to_discharge = 0
+
+    def speed_of(self, command: float) -> float:
+        """Rotor speed, rad/s, that a motor command (normalised) settles at."""
+        train = self.powertrain
+        ratio = command / train.hover_command
+        if ratio <= 0.0:
+            return 0.0
+        believed, other = (ratio**0.5, ratio) if train.linear else (ratio, ratio**0.5)
+        return train.hover_speed * (believed + train.speed_blend * (other - believed))
+
+    def spin(self, speed: float) -> None:
+        """Set all rotors to a speed (rad/s), to start a simulation in the air."""
+        self.motion.speeds[:] = (speed,) * 4
+
+    def act(self, position: memoryview, velocity: memoryview, commands: list[float], wrench: memoryview) -> None:
+        """Advance the rotors by one step and write force (world) and torque (body) of that step into `wrench`.
+
+        `position` and `velocity` are those of `World`; `commands` the four motor commands, 0 to 1.
+        """
+        m = self.motion
+        m.x, m.y, m.z, qw, qx, qy, qz = position.tolist()
+        m.vx, m.vy, m.vz, m.p, m.q, m.r = velocity.tolist()
+        xx, yy, zz = 2.0 * qx * qx, 2.0 * qy * qy, 2.0 * qz * qz
+        xy, xz, yz = 2.0 * qx * qy, 2.0 * qx * qz, 2.0 * qy * qz
+        wx, wy, wz = 2.0 * qw * qx, 2.0 * qw * qy, 2.0 * qw * qz
+        m.r00, m.r01, m.r02 = r00, r01, r02 = 1.0 - yy - zz, xy - wz, xz + wy
+        m.r10, m.r11, m.r12 = r10, r11, r12 = xy + wz, 1.0 - xx - zz, yz - wx
+        m.r20, m.r21, m.r22 = r20, r21, r22 = xz - wy, yz + wx, 1.0 - xx - yy
+        wind = self.wind
+        ax, ay, az = m.vx - wind[0], m.vy - wind[1], m.vz - wind[2]
+        m.u = r00 * ax + r10 * ay + r20 * az
+        m.v = r01 * ax + r11 * ay + r21 * az
+        m.w = r02 * ax + r12 * ay + r22 * az
+
+        train = self.powertrain
+        constants = train.thrust_constants
+        hover_speed, hover_command, blend = train.hover_speed, train.hover_command, train.speed_blend
+        linear, follow = train.linear, self._follow
+        speeds, thrusts = m.speeds, m.thrusts
+        power = 0.0
+        for i in (0, 1, 2, 3):
+            ratio = commands[i] / hover_command
+            if linear:
+                target = ratio**0.5
+                if blend:
+                    target += blend * (ratio - target)
+            else:
+                target = ratio + blend * (ratio**0.5 - ratio) if blend else ratio
+            before = speeds[i]
+            change = follow * (hover_speed * target - before)
+            speeds[i] = before + change
+            # The mean speed of the step, so that the lag is the believed one and not half a step more.
+            middle = before + 0.5 * change
+            thrust = constants[i] * middle * middle
+            thrusts[i] = thrust
+            power += thrust * middle
+        m.voltage = self.battery.load(power * self._power_per_speed + _AVIONICS_POWER)
+        self._steps_to_discharge -= 1
+        if self._steps_to_discharge <= 0:
+            self._steps_to_discharge = _DISCHARGE_STEPS
+            self.battery.discharge(_DISCHARGE_STEPS * self.dt)
+
+        for act in self.on_rotors:
+            act(m)
+        t0, t1, t2, t3 = thrusts
+        (x0, y0, c0), (x1, y1, c1), (x2, y2, c2), (x3, y3, c3) = self._arms
+        body = m.wrench
+        body[0] = body[1] = 0.0
+        body[2] = t0 + t1 + t2 + t3
+        body[3] = y0 * t0 + y1 * t1 + y2 * t2 + y3 * t3
+        body[4] = -(x0 * t0 + x1 * t1 + x2 * t2 + x3 * t3)
+        # A rotor that turns counter-clockwise is braked clockwise by the air, and so is the body that holds it.
+        body[5] = -(c0 * t0 + c1 * t1 + c2 * t2 + c3 * t3)
+        for act in self.on_body:
+            act(m)
+        fx, fy, fz, wrench[3], wrench[4], wrench[5] = body
+        wrench[0] = r00 * fx + r01 * fy + r02 * fz
+        wrench[1] = r10 * fx + r11 * fy + r12 * fz
+        wrench[2] = r20 * fx + r21 * fy + r22 * fz

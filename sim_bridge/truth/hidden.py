@@ -1,0 +1,382 @@
+"""Physical effects that the simulator can hide, one small class each, by the project's standard names.
+
+The formulas are the simulator's own: per rotor, in forces and rotor speeds. Add an effect by writing a class with
+`@register`; it may change the powertrain's numbers, act on the rotors, act on the body, or bias the sensors.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import random
+from dataclasses import dataclass, replace
+
+from models.errors import InputError
+from models.vehicle import GRAVITY, Vehicle
+from sim_bridge.truth.airframe import AIR_DENSITY, Act, Airframe, Motion, Powertrain
+from sim_bridge.truth.sensors import Sensors
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """One hidden effect with every number that it acts by."""
+
+    name: str
+    parameters: dict[str, float]
+
+    def answer(self) -> dict[str, object]:
+        """As `sim-bridge reveal` tells it: name and parameters with their units."""
+        units = EFFECTS[self.name].units
+        return {
+            "name": self.name,
+            "parameters": {key: {"value": value, "unit": units[key]} for key, value in self.parameters.items()},
+        }
+
+
+class Effect:
+    """A hidden effect: `size` is its main number, between `low` and `high` when drawn.
+
+    `units` names every parameter of the effect with its unit, the first being the size.
+    """
+
+    name: str
+    what: str
+    low: float
+    high: float
+    units: dict[str, str]
+    least: float = 0.0
+    most: float = math.inf
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """All parameters, drawn, or around a given size."""
+        drawn = generator.uniform(self.low, self.high)
+        return {next(iter(self.units)): drawn if size is None else size}
+
+    def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
+        """The powertrain with this effect."""
+        return train
+
+    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+        """Let the effect act on rotors, body or sensors; `others` are the names of all that is hidden with it."""
+
+
+EFFECTS: dict[str, Effect] = {}
+
+
+def register(effect: type[Effect]) -> type[Effect]:
+    """Make an effect known by its name."""
+    EFFECTS[effect.name] = effect()
+    return effect
+
+
+@register
+class ThrustGain(Effect):
+    """Other propellers than believed: every rotor's thrust constant is off by one factor."""
+
+    name, what = "thrust_gain", "thrust of every rotor is off by a factor"
+    low, high, least, most = 0.80, 1.20, 0.5, 2.0
+    units = {"gain": "1"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """Off by 7 to 20 %, up or down; nothing is hidden in a gain of one."""
+        off = generator.uniform(0.07, 0.20) * generator.choice((-1.0, 1.0))
+        return {"gain": 1.0 + off if size is None else size}
+
+    def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
+        """Thrust constants times the gain."""
+        a, b, c, d = train.thrust_constants
+        gain = numbers["gain"]
+        return replace(train, thrust_constants=(gain * a, gain * b, gain * c, gain * d))
+
+
+@register
+class ThrustCurve(Effect):
+    """The speed controller turns commands into rotor speed by another curve, with the same hover."""
+
+    name, what = "thrust_curve", "the map from command to rotor speed is another curve, right at hover only"
+    low, high, least, most = 0.35, 0.9, -0.5, 1.5
+    units = {"speed_blend": "1"}
+
+    def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
+        """Rotor speed becomes a blend of the square-root and the proportional map."""
+        return replace(train, speed_blend=numbers["speed_blend"])
+
+
+@register
+class BatterySag(Effect):
+    """Rotor speed is not regulated: thrust follows a power of the voltage."""
+
+    name, what = "battery_sag", "thrust follows a power of the battery's voltage over the nominal one"
+    low, high, least, most = 0.9, 2.0, -4.0, 4.0
+    units = {"exponent": "1"}
+
+    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+        """All thrusts times (V / V_nominal) to the exponent."""
+        nominal, exponent = airframe.vehicle.nominal_voltage, numbers["exponent"]
+
+        def act(m: Motion) -> None:
+            factor = (m.voltage / nominal) ** exponent
+            thrusts = m.thrusts
+            for i in (0, 1, 2, 3):
+                thrusts[i] *= factor
+
+        airframe.on_rotors.append(act)
+
+
+@register
+class MotorLag(Effect):
+    """Rotors take longer to change speed than measured on the bench."""
+
+    name, what = "motor_lag", "the rotors' speed lags its command with another time constant"
+    low, high, least, most = 0.045, 0.080, 0.0, 1.0
+    units = {"time_constant": "s"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """At least 25 ms above the believed one, else it would not be hidden but absent."""
+        least = max(self.low, vehicle.motor_time_constant + 0.025)
+        drawn = generator.uniform(least, max(self.high, least + 0.02))
+        return {"time_constant": drawn if size is None else size}
+
+    def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
+        """The true time constant of rotor speed."""
+        return replace(train, time_constant=numbers["time_constant"])
+
+
+@register
+class TransportDelay(Effect):
+    """Setpoints reach the motors later than believed."""
+
+    name, what = "transport_delay", "setpoints reach the motors later than believed, by this much more"
+    low, high, least, most = 0.020, 0.045, 0.0, 0.5
+    units = {"extra_delay": "s"}
+
+    def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
+        """The believed delay plus the hidden one."""
+        return replace(train, delay=train.delay + numbers["extra_delay"])
+
+
+@register
+class RotorDrag(Effect):
+    """H-force of each rotor, proportional to its speed and to the air's velocity at its hub, in the rotor plane.
+
+    Source: Martin and Salaün, "The true role of accelerometer feedback in quadrotor control", ICRA 2010; Faessler
+    et al., "Differential flatness of quadrotor dynamics subject to rotor drag", RA-L 2018.
+    """
+
+    name, what = "rotor_drag", "each rotor drags in its plane, in proportion to its speed and the air's velocity there"
+    low, high, most = 0.15, 0.45, 5.0
+    units = {"x": "1/s", "y": "1/s"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """Acceleration per speed at hover along body x, and up to 25 % more along y."""
+        x = generator.uniform(self.low, self.high)
+        ratio = generator.uniform(1.0, 1.25)
+        x = x if size is None else size
+        return {"x": x, "y": ratio * x}
+
+    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+        """Force -c omega_i V_i at every hub, V_i with the velocity that the body's rates give the hub."""
+        airframe.on_body.append(rotor_drag(airframe, numbers["x"], numbers["y"]))
+
+
+def rotor_drag(airframe: Airframe, x_per_s: float, y_per_s: float) -> Act:
+    """The H-force of four rotors, given as acceleration per speed (1/s) when all turn at hover speed."""
+    per_rotor = airframe.vehicle.mass / (4 * airframe.powertrain.hover_speed)
+    cx, cy = x_per_s * per_rotor, y_per_s * per_rotor
+    hubs = tuple(airframe.vehicle.rotor_positions)
+
+    def act(m: Motion) -> None:
+        u, v, p, q, r = m.u, m.v, m.p, m.q, m.r
+        fx = fy = tx = ty = tz = 0.0
+        for speed, (x, y, z) in zip(m.speeds, hubs, strict=True):
+            hx = -cx * speed * (u + q * z - r * y)
+            hy = -cy * speed * (v + r * x - p * z)
+            fx += hx
+            fy += hy
+            tx -= z * hy
+            ty += z * hx
+            tz += x * hy - y * hx
+        body = m.wrench
+        body[0] += fx
+        body[1] += fy
+        body[3] += tx
+        body[4] += ty
+        body[5] += tz
+
+    return act
+
+
+@register
+class ParasiticDrag(Effect):
+    """Dynamic pressure on the frame, with an area of its own along each body axis.
+
+    Source: Hoerner, "Fluid-Dynamic Drag", 1965: drag 0.5 rho C_D A |V| V.
+    """
+
+    name, what = "parasitic_drag", "the frame drags with the square of the air's velocity"
+    low, high, most = 0.05, 0.14, 5.0
+    units = {"x": "1/m", "y": "1/m", "z": "1/m"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """Acceleration per speed squared along body x; y and z have larger areas."""
+        x = generator.uniform(self.low, self.high)
+        y_ratio, z_ratio = generator.uniform(1.0, 1.3), generator.uniform(1.2, 1.8)
+        x = x if size is None else size
+        return {"x": x, "y": y_ratio * x, "z": z_ratio * x}
+
+    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+        """Force -0.5 rho (C_D A)_axis |V| V_axis at the centre of mass."""
+        areas = [2.0 * airframe.vehicle.mass * numbers[axis] / AIR_DENSITY for axis in "xyz"]
+        ax, ay, az = (0.5 * AIR_DENSITY * area for area in areas)
+
+        def act(m: Motion) -> None:
+            u, v, w = m.u, m.v, m.w
+            speed = (u * u + v * v + w * w) ** 0.5
+            body = m.wrench
+            body[0] -= ax * speed * u
+            body[1] -= ay * speed * v
+            body[2] -= az * speed * w
+
+        airframe.on_body.append(act)
+
+
+@register
+class GroundEffect(Effect):
+    """Each rotor feels the images of all four below the ground, at the heights that the attitude gives their hubs.
+
+    Method of images: Cheeseman and Bennett, ARC R&M 3021, 1955, for the rotor's own image; Sanchez-Cuenca et al.,
+    "Characterization of the aerodynamic ground effect and its influence in multirotor control", 2017, for those of
+    its neighbours. The effective radius is larger than the propeller's, as measured on small quadrotors.
+    """
+
+    name, what = "ground_effect", "each rotor's thrust rises near the ground, by the images of all four"
+    low, high, most = 2.0, 3.2, 6.0
+    units = {"radius_factor": "1"}
+
+    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+        """Thrust of rotor i over 1 - sum_j (R²/2) h / (d_ij² + 4 h²)^(3/2), h the mean height of hubs i and j."""
+        hubs = tuple(airframe.vehicle.rotor_positions)
+        radius = numbers["radius_factor"] * airframe.vehicle.rotor_radius
+        half_square = 0.5 * radius * radius
+        # Below a quarter of the radius the images leave their range of validity; the feet are longer than that.
+        least, ceiling = 0.25 * radius, 20.0 * radius
+        apart = tuple(
+            tuple((xi - xj) ** 2 + (yi - yj) ** 2 for xj, yj, _ in hubs) for xi, yi, _ in hubs
+        )
+
+        def act(m: Motion) -> None:
+            z = m.z
+            if z > ceiling:
+                return
+            heights = [max(z + m.r20 * hx + m.r21 * hy + m.r22 * hz, least) for hx, hy, hz in hubs]
+            thrusts = m.thrusts
+            gains = []
+            for i in (0, 1, 2, 3):
+                row, own, total = apart[i], heights[i], 0.0
+                for j in (0, 1, 2, 3):
+                    h = 0.5 * (own + heights[j])
+                    total += h / (row[j] + 4.0 * h * h) ** 1.5
+                gains.append(1.0 / (1.0 - min(half_square * total, 0.5)))
+            for i in (0, 1, 2, 3):
+                thrusts[i] *= gains[i]
+
+        airframe.on_rotors.append(act)
+
+
+@register
+class Wind(Effect):
+    """Steady wind. It acts through drag: where no drag is hidden with it, the rotors drag as known for such frames."""
+
+    name, what = "wind", "a steady horizontal wind, acting through rotor drag"
+    low, high, most = 3.0, 5.5, 15.0
+    units = {"speed": "m/s", "east": "m/s", "north": "m/s", "drag": "1/s"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """A speed (m/s) from any direction."""
+        speed, direction = generator.uniform(self.low, self.high), generator.uniform(-math.pi, math.pi)
+        speed = speed if size is None else size
+        east, north = speed * math.cos(direction), speed * math.sin(direction)
+        return {"speed": speed, "east": east, "north": north, "drag": generator.uniform(0.18, 0.28)}
+
+    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+        """Move the air; bring rotor drag along if nothing else drags."""
+        airframe.wind = (numbers["east"], numbers["north"], 0.0)
+        if not others & {"rotor_drag", "parasitic_drag"}:
+            airframe.on_body.append(rotor_drag(airframe, numbers["drag"], numbers["drag"]))
+
+
+@register
+class AccelerometerBias(Effect):
+    """The accelerometer reads a constant in body axes."""
+
+    name, what = "accelerometer_bias", "the accelerometer reads a constant off, in body axes"
+    low, high, most = 0.2, 0.5, 0.3 * GRAVITY
+    units = {"size": "m/s^2", "x": "m/s^2", "y": "m/s^2", "z": "m/s^2"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """A size (m/s²) in any direction."""
+        drawn = generator.uniform(self.low, self.high)
+        size = drawn if size is None else size
+        axis = [generator.gauss(0.0, 1.0) for _ in range(3)]
+        length = math.sqrt(sum(x * x for x in axis))
+        x, y, z = (size * component / length for component in axis)
+        return {"size": size, "x": x, "y": y, "z": z}
+
+    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+        """Added to every reading."""
+        sensors.accelerometer_bias = (numbers["x"], numbers["y"], numbers["z"])
+
+
+def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> tuple[Hidden, ...]:
+    """What to hide, from `NAME`, `NAME:SIZE`, `none` or `random` requests; the same seed hides the same.
+
+    `random` draws `count` different effects. Raises `InputError` for an unknown name or a size out of range.
+    """
+    chosen: dict[str, Hidden] = {}
+    for request in requests:
+        if request == "none":
+            if len(requests) > 1:
+                raise InputError("--hidden none cannot be combined with another --hidden; drop one of them")
+            return ()
+        if request == "random":
+            if not 1 <= count <= len(EFFECTS):
+                raise InputError(f"--hidden-count {count} must be 1 to {len(EFFECTS)}")
+            generator = random.Random(f"trueflight {seed}")
+            for name in generator.sample(list(EFFECTS), count):
+                chosen[name] = _make(name, None, vehicle, seed)
+            continue
+        name, colon, text = request.partition(":")
+        if name not in EFFECTS:
+            close = difflib.get_close_matches(name, [*EFFECTS, "random", "none"], 1)
+            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(EFFECTS)}, random, none"
+            raise InputError(f"--hidden {request}: unknown effect '{name}'; {hint}")
+        effect, size = EFFECTS[name], None
+        if colon:
+            try:
+                size = float(text)
+            except ValueError:
+                raise InputError(f"--hidden {request}: '{text}' is not a number; write NAME or NAME:SIZE") from None
+            if not effect.least <= size <= effect.most:
+                unit = next(iter(effect.units.values()))
+                raise InputError(f"--hidden {request}: size must be {effect.least:g} to {effect.most:g} {unit}")
+        chosen[name] = _make(name, size, vehicle, seed)
+    return tuple(chosen.values())
+
+
+def _make(name: str, size: float | None, vehicle: Vehicle, seed: int) -> Hidden:
+    # A generator of its own for each effect, so that hiding one more does not change the others.
+    return Hidden(name, EFFECTS[name].draw(vehicle, size, random.Random(f"trueflight {seed} {name}")))
+
+
+def install(
+    vehicle: Vehicle, hidden: tuple[Hidden, ...], believed: Powertrain, sensors: Sensors, dt: float
+) -> tuple[Powertrain, Airframe]:
+    """The true powertrain and airframe: what the owner believes, changed by what is hidden."""
+    train = believed
+    for one in hidden:
+        train = EFFECTS[one.name].powertrain(train, vehicle, one.parameters)
+    airframe = Airframe(vehicle, train, dt)
+    names = frozenset(one.name for one in hidden)
+    for one in hidden:
+        EFFECTS[one.name].attach(airframe, sensors, one.parameters, names)
+    return train, airframe
