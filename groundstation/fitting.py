@@ -37,6 +37,8 @@ class Free:
     start: float
     low: float
     high: float
+    neutral: float
+    tolerance: float = 0.0
     nuisance: bool = False
 
 
@@ -113,15 +115,16 @@ class Fit:
         columns = self.of(effect)
         if not columns:
             return 1.0
-        neutral = np.array([f.start if f.nuisance else _neutral(f) for f in (self.free[i] for i in columns)])
+        neutral = np.array([self._neutral(i) for i in columns])
         difference = self.estimate[columns] - neutral
         covariance = self.covariance[np.ix_(columns, columns)]
         statistic = float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
         return float(stats.chi2.sf(statistic * (1.96 / self.critical) ** 2, len(columns)))
 
-
-def _neutral(free: Free) -> float:
-    return free.parameter.neutral if isinstance(free.parameter.neutral, float) else free.start
+    def _neutral(self, index: int) -> float:
+        """Value without effect; for a delay the nearest that the clock's tolerance allows."""
+        free = self.free[index]
+        return float(np.clip(self.estimate[index], free.neutral - free.tolerance, free.neutral + free.tolerance))
 
 
 def critical_value(duration: float) -> float:
@@ -130,8 +133,10 @@ def critical_value(duration: float) -> float:
     return 1.9600 + 2.9694 * b + 0.4160 * b**2 - 0.5324 * b**3
 
 
-def free_parameters(effect: Effect, vehicle: Vehicle, start: Mapping[str, float] | None = None) -> list[Free]:
-    """The numbers of `effect` to fit. Bounds reach a little beyond the plausible range, so that data may contradict
+def free_parameters(
+    effect: Effect, vehicle: Vehicle, start: Mapping[str, float] | None = None, period: float = 0.0
+) -> list[Free]:
+    """The numbers of `effect` to fit, on a clock of `period` s. Bounds reach a little beyond the plausible range, so that data may contradict
     the effect instead of resting on its bound."""
     free = []
     for p in effect.parameters:
@@ -139,7 +144,9 @@ def free_parameters(effect: Effect, vehicle: Vehicle, start: Mapping[str, float]
         margin = 0.0 if effect.stage is Stage.COMMAND or effect.name == "ground_effect" else 2.0 * abs(p.typical - neutral)
         value = (start or {}).get(p.name, neutral + 0.3 * (p.typical - neutral))
         low, high = p.low - margin, p.high + margin
-        free.append(Free(effect.name, p, float(np.clip(value, low + 1e-9, high - 1e-9)), low, high))
+        tolerance = period if effect.name == "transport_delay" else 0.0
+        value = float(np.clip(value, low + 1e-9, high - 1e-9))
+        free.append(Free(effect.name, p, value, low, high, neutral, tolerance))
     return free
 
 
@@ -158,17 +165,16 @@ def fit(
     vehicle, names = problem.vehicle, [t.effect for t in terms]
     fixed = {t.effect: dict(t.values) for t in terms}
     free: list[Free] = []
+    period = max(m.flight.dt for m in problem.measurements)
     for term in terms:
         if refit is None or term.effect in refit:
-            free += free_parameters(effect_named(term.effect, problem.effects_directory), vehicle, term.values or None)
+            effect = effect_named(term.effect, problem.effects_directory)
+            free += free_parameters(effect, vehicle, term.values or None, period)
     chain_names = list(names)
     if clock and "transport_delay" not in names:
-        period = max(m.flight.dt for m in problem.measurements)
-        delay = effect_named("transport_delay").parameters[0]
-        low = max(0.0, vehicle.command_delay - period)
-        free.append(
-            Free("transport_delay", delay, vehicle.command_delay, low, vehicle.command_delay + period, nuisance=True)
-        )
+        parameter, believed = effect_named("transport_delay").parameters[0], vehicle.command_delay
+        low, high = max(0.0, believed - period), believed + period
+        free.append(Free("transport_delay", parameter, believed, low, high, believed, period, nuisance=True))
         chain_names.append("transport_delay")
     effects = [effect_named(n, problem.effects_directory) for n in chain_names]
     measured = problem.measured()

@@ -1,0 +1,433 @@
+"""Command lines of the heart: compare, where, diagnose, model."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from models.errors import InputError
+
+if TYPE_CHECKING:
+    from models.flight import Flight
+    from models.model import Model
+
+console = Console()
+model_app = typer.Typer(no_args_is_help=True, help="Make, list, show and export model versions.")
+
+FlightArgument = Annotated[Path, typer.Argument(help="A flight: CSV, Parquet, MCAP record or PX4 ULog.")]
+VehicleOption = Annotated[Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")]
+MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML that maps the file's columns.")]
+ModelOption = Annotated[str | None, typer.Option("--model", help="A version number, or a model's JSON file.")]
+StoreOption = Annotated[Path, typer.Option("--store", help="Folder of the model versions.")]
+EffectsOption = Annotated[Path | None, typer.Option("--effects", help="Folder of your own effects, one file each.")]
+BandwidthOption = Annotated[float | None, typer.Option("--bandwidth", help="Low-pass for both sides, Hz.", min=0.1)]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+RecordingOption = Annotated[Path | None, typer.Option("--rrd", help="Write a Rerun recording here.")]
+DEFAULT_STORE = Path("trueflight-models")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the analysis commands to the ground station's application."""
+    app.command("compare")(compare_command)
+    app.command("where")(where_command)
+    app.command("diagnose")(diagnose_command)
+    app.command("effects")(effects_command)
+    app.add_typer(model_app, name="model")
+
+
+def print_json(table: Any) -> None:
+    """One JSON document on standard output."""
+    typer.echo(json.dumps(table, indent=1, allow_nan=False))
+
+
+def _read(path: Path, vehicle: Path | None, mapping: Path | None) -> Flight:
+    from groundstation.reading import read_flight
+
+    return read_flight(path, vehicle, mapping)
+
+
+def _model(which: str | None, flight: Flight, store: Path, effects: Path | None) -> Model:
+    """The model asked for; else the newest version of the vehicle; else linear with exact rotation."""
+    from dataclasses import replace
+
+    from groundstation.store import find, newest
+    from models.model import linear_model, rigid_body_model
+
+    directory = None if effects is None else str(effects)
+    if which == "linear":
+        return linear_model(flight.vehicle)
+    model = newest(store, flight.vehicle, directory) if which is None else find(store, flight.vehicle.name, which)
+    if model is None:
+        return rigid_body_model(flight.vehicle, directory)
+    check_vehicle(model, flight)
+    return replace(model, effects_directory=directory or model.effects_directory)
+
+
+def check_vehicle(model: Model, flight: Flight) -> None:
+    """Raise `InputError` where a model was made for another vehicle than the one that flew."""
+    if model.vehicle.name != flight.vehicle.name:
+        raise InputError(
+            f"{model.label} was made for vehicle '{model.vehicle.name}', the flight {flight.name} is of "
+            f"'{flight.vehicle.name}'; pass another --model or --vehicle"
+        )
+    for name in ("mass", "hover_thrust", "thrust_model"):
+        if getattr(model.vehicle, name) != getattr(flight.vehicle, name):
+            raise InputError(
+                f"{model.label} was made for {name} = {getattr(model.vehicle, name)}, {flight.vehicle.source or 'the flight'} "
+                f"says {getattr(flight.vehicle, name)}; make a new model, or pass the vehicle file it was made with"
+            )
+
+
+def compare_command(
+    flight: FlightArgument,
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
+    model: ModelOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    effects: EffectsOption = None,
+    bandwidth: BandwidthOption = None,
+    rrd: RecordingOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Model against measurement: residual per axis, noise floor, share explained, open-loop error.
+
+    Shows the linear model, and every version that led to the newest (or to --model).
+
+    Example: groundstation compare identify.csv --vehicle vehicle.toml --rrd compare.rrd
+    """
+    from groundstation import as_json as tables_json
+    from groundstation.compare import compare
+    from groundstation.tables import print_comparisons, print_where
+    from groundstation.where import where_it_fails
+
+    read = _read(flight, vehicle, mapping)
+    results = [compare(read, m, bandwidth) for m in _versions(_model(model, read, store, effects), store)]
+    where = where_it_fails(results[-1])
+    if rrd is not None:
+        from groundstation.views import write_comparison
+
+        write_comparison(rrd, results, where)
+    if as_json:
+        last = tables_json.comparison_table(results[-1])
+        print_json(
+            {
+                **last,
+                "versions": [tables_json.comparison_table(c) for c in results],
+                "where": tables_json.where_table(where),
+                "recording": None if rrd is None else str(rrd),
+            }
+        )
+        return
+    print_comparisons(console, results)
+    print_where(console, where)
+    if rrd is not None:
+        console.print(f"Rerun recording: {rrd}")
+
+
+def _versions(model: Model, store: Path) -> list[Model]:
+    """The linear model, and the versions from it to `model`."""
+    from groundstation.store import lineage
+    from models.model import linear_model
+
+    if model.version == 0:
+        return [linear_model(model.vehicle), model] if model.terms else [model]
+    return lineage(store, model)
+
+
+def where_command(
+    flight: FlightArgument,
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
+    model: ModelOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    effects: EffectsOption = None,
+    bandwidth: BandwidthOption = None,
+    rrd: RecordingOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Where a model fails: the residual against height, speed, tilt, thrust, voltage, time and place.
+
+    Example: groundstation where identify.csv --vehicle vehicle.toml --rrd where.rrd
+    """
+    from groundstation import as_json as tables_json
+    from groundstation.compare import compare
+    from groundstation.tables import print_where
+    from groundstation.where import where_it_fails
+
+    read = _read(flight, vehicle, mapping)
+    result = compare(read, _model(model, read, store, effects), bandwidth, horizons=False)
+    where = where_it_fails(result)
+    if rrd is not None:
+        from groundstation.views import write_where
+
+        write_where(rrd, result, where)
+    if as_json:
+        print_json({"model": result.label, "rms": result.rms, **tables_json.where_table(where)})
+        return
+    print_where(console, where)
+    if rrd is not None:
+        console.print(f"Rerun recording: {rrd}")
+
+
+def diagnose_command(
+    flight: FlightArgument,
+    vehicle: VehicleOption = None,
+    validate: Annotated[Path | None, typer.Option("--validate", help="Another flight, held out of every fit.")] = None,
+    mapping: MappingOption = None,
+    model: ModelOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    effects: EffectsOption = None,
+    bandwidth: BandwidthOption = None,
+    everything: Annotated[bool, typer.Option("--all", help="Parameters of every effect, found or not.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Which effect is missing: ranked, with parameters and intervals, checked on held-out data.
+
+    Example: groundstation diagnose identify.csv --vehicle vehicle.toml --validate validate.csv --json
+    """
+    from groundstation.as_json import diagnosis_table
+    from groundstation.diagnosis import diagnose
+    from groundstation.tables import print_diagnosis
+
+    read = _read(flight, vehicle, mapping)
+    held_out = None if validate is None else _read(validate, vehicle or _same(read), mapping)
+    base = _model(model, read, store, effects)
+    if "rigid_body" not in base.names():
+        from models.model import rigid_body_model
+
+        base = rigid_body_model(read.vehicle, base.effects_directory)
+    with nullcontext() if as_json else console.status("looking for missing effects") as status:
+        result = diagnose(
+            read, base, held_out, bandwidth, progress=(lambda text: None) if status is None else status.update
+        )
+    if as_json:
+        print_json(diagnosis_table(result))
+        return
+    print_diagnosis(console, result, everything)
+
+
+def _same(flight: Flight) -> Path | None:
+    """The vehicle file of the first flight also serves the second."""
+    source = Path(flight.vehicle.source)
+    return source if source.is_file() else None
+
+
+def effects_command(
+    name: Annotated[str | None, typer.Argument(help="One effect, in full.")] = None,
+    effects: EffectsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The catalogue of effects: what each is, what excites it, what it is confounded with.
+
+    Example: groundstation effects ground_effect
+    """
+    from rich.table import Table
+
+    from models.effects import catalogue, effect_named
+
+    directory = None if effects is None else str(effects)
+    shown = list(catalogue(directory).values()) if name is None else [effect_named(name, directory)]
+    if as_json:
+        print_json(
+            [
+                {
+                    "name": e.name,
+                    "title": e.title,
+                    "formula": " ".join((e.formula.__doc__ or "").split()),
+                    "parameters": {
+                        p.name: {"unit": p.unit, "meaning": p.meaning, "low": p.low, "high": p.high} for p in e.parameters
+                    },
+                    "needs": list(e.needs),
+                    "manoeuvre": e.manoeuvre,
+                    "confounded_with": list(e.confounded_with),
+                    "citation": e.citation,
+                    "exports": e.exports,
+                }
+                for e in shown
+            ]
+        )
+        return
+    if name is not None:
+        e = shown[0]
+        console.print(f"[bold]{e.name}[/bold]: {e.title}")
+        console.print(" ".join((e.formula.__doc__ or "").split()), highlight=False, markup=False)
+        for p in e.parameters:
+            unit = "" if p.unit == "1" else f" {p.unit}"
+            console.print(f"  {p.name}: {p.meaning}, {p.low:g} to {p.high:g}{unit}")
+        console.print(f"needs: {', '.join(e.needs)}")
+        console.print(f"fly: {e.manoeuvre}")
+        console.print(f"confounded with: {', '.join((*e.confounded_with, *e.aliases)) or 'nothing known'}")
+        console.print(f"source: {e.citation}")
+        return
+    table = Table()
+    table.add_column("effect", no_wrap=True)
+    table.add_column("what it is")
+    table.add_column("parameters")
+    for e in shown:
+        table.add_row(e.name, e.title, ", ".join(p.name if p.unit == "1" else f"{p.name} ({p.unit})" for p in e.parameters))
+    console.print(table)
+
+
+@model_app.command("add")
+def model_add(
+    effect: Annotated[str, typer.Argument(help="Name of the effect: groundstation effects")],
+    flight: Annotated[Path, typer.Option("--flight", help="The flight to fit to.")],
+    validate: Annotated[Path | None, typer.Option("--validate", help="Another flight, to see the error fall on.")] = None,
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
+    model: ModelOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    effects: EffectsOption = None,
+    bandwidth: BandwidthOption = None,
+    rrd: RecordingOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Add an effect: refit, write a new model version, and show the error falling.
+
+    Example: groundstation model add rotor_drag --flight identify.csv --validate validate.csv
+    """
+    from groundstation import as_json as tables_json
+    from groundstation.compare import waterfall
+    from groundstation.store import add_effect, lineage, save
+    from groundstation.tables import print_waterfall
+
+    read = _read(flight, vehicle, mapping)
+    held_out = None if validate is None else _read(validate, vehicle or _same(read), mapping)
+    base = _model(model, read, store, effects)
+    with nullcontext() if as_json else console.status(f"fitting {effect}"):
+        made = add_effect(base, effect, [read], bandwidth)
+    made, path = save(store, made, base if base.version else None)
+    line = lineage(store, made)
+    if base.version == 0 and base.terms:
+        line.insert(1, base)
+    steps = waterfall(read, held_out, line, bandwidth)
+    if rrd is not None:
+        from groundstation.views import write_before_after
+
+        write_before_after(rrd, [(m, read, held_out) for m in line], steps)
+    if as_json:
+        print_json(
+            {
+                **tables_json.model_table(made),
+                "path": str(path),
+                "waterfall": tables_json.waterfall_table(steps),
+                "recording": None if rrd is None else str(rrd),
+            }
+        )
+        return
+    print_waterfall(console, steps, read.name, None if held_out is None else held_out.name)
+    term = made.terms[-1]
+    for name, value in term.values.items():
+        low, high = term.intervals[name]
+        console.print(f"{effect} {name} = {value:.4g}  [{low:.4g}, {high:.4g}]")
+    console.print(f"model version: {path}")
+    if rrd is not None:
+        console.print(f"Rerun recording: {rrd}")
+
+
+@model_app.command("list")
+def model_list(
+    vehicle: Annotated[str | None, typer.Argument(help="Name of the vehicle; default: all.")] = None,
+    store: StoreOption = DEFAULT_STORE,
+    as_json: JsonOption = False,
+) -> None:
+    """The versions in the store.
+
+    Example: groundstation model list quad5
+    """
+    from rich.table import Table
+
+    from groundstation.as_json import model_table
+    from groundstation.store import versions
+    from models.model import read_model
+
+    if not store.is_dir():
+        raise InputError(f"{store}: no model store here; 'groundstation model add' makes one, --store DIR names another")
+    names = [vehicle] if vehicle else sorted(p.name for p in store.iterdir() if p.is_dir())
+    models = [read_model(path) for name in names for path in versions(store, name)]
+    if as_json:
+        print_json([model_table(m) for m in models])
+        return
+    table = Table()
+    for column in ("vehicle", "version", "from", "effects", "fit RMS m/s²", "made"):
+        table.add_column(column)
+    for m in models:
+        parent = "linear" if m.parent is None else f"v{m.parent}"
+        table.add_row(
+            m.vehicle.name, f"v{m.version}", parent, ", ".join(m.names()), f"{m.fit.get('rms', 0.0):.3f}", m.created
+        )
+    console.print(table)
+
+
+@model_app.command("show")
+def model_show(
+    which: Annotated[str, typer.Argument(help="Version number, or the model's JSON file.")],
+    vehicle: Annotated[str, typer.Option("--vehicle-name", help="Name of the vehicle, for a version number.")] = "",
+    store: StoreOption = DEFAULT_STORE,
+    as_json: JsonOption = False,
+) -> None:
+    """One version: its effects and parameters.
+
+    Example: groundstation model show v2 --vehicle-name quad5
+    """
+    from groundstation.as_json import model_table
+    from groundstation.store import find
+
+    model = find(store, vehicle or _only_vehicle(store), which)
+    if as_json:
+        print_json(model_table(model))
+        return
+    console.print(f"{model.label} of {model.vehicle.name}, made {model.created}, fit RMS {model.fit.get('rms', 0):.3f} m/s²")
+    for term in model.terms:
+        values = ", ".join(
+            f"{k} = {v:.4g} [{term.intervals[k][0]:.4g}, {term.intervals[k][1]:.4g}]" if k in term.intervals else f"{k} = {v:.4g}"
+            for k, v in term.values.items()
+        )
+        console.print(f"  {term.effect}  {values}", highlight=False)
+
+
+@model_app.command("export")
+def model_export(
+    which: Annotated[str, typer.Argument(help="Version number, or the model's JSON file.")],
+    flight: Annotated[Path, typer.Option("--flight", help="Flight that gives the training range and golden vectors.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The ONNX file to write.")],
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a version as one ONNX file with its contract, ready to deploy.
+
+    Example: groundstation model export v2 --flight identify.csv -o correction.onnx
+    """
+    from groundstation.store import find
+    from models.contract import model_hash
+    from models.export import export_onnx, not_exported
+
+    read = _read(flight, vehicle, mapping)
+    model = find(store, read.vehicle.name, which)
+    check_vehicle(model, read)
+    data = export_onnx(model, read)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    temporary = output.with_name(output.name + ".part")
+    temporary.write_bytes(data)
+    temporary.replace(output)
+    left = not_exported(model)
+    if as_json:
+        print_json({"path": str(output), "hash": model_hash(data), "bytes": len(data), "not_exported": list(left)})
+        return
+    console.print(f"{output}: {model.label}, {len(data) / 1000:.0f} kB, hash {model_hash(data)}")
+    if left:
+        console.print(f"not in it, for a static correction has no memory and no sensor: {', '.join(left)}", style="yellow")
+
+
+def _only_vehicle(store: Path) -> str:
+    names = sorted(p.name for p in store.iterdir() if p.is_dir()) if store.is_dir() else []
+    if len(names) != 1:
+        raise InputError(f"{store}: holds {len(names)} vehicles; say which with --vehicle-name")
+    return names[0]

@@ -1,0 +1,146 @@
+"""What the analyses look like in a terminal of 100 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from groundstation.diagnosis import Diagnosis, EffectVerdict
+from groundstation.results import Comparison, WaterfallStep, WhereItFails
+
+VERDICT_STYLE = {
+    "missing": "bold red",
+    "possible": "yellow",
+    "included": "green",
+    "not_excited": "cyan",
+    "not_supported": "dim",
+}
+SAID = {
+    "missing": "MISSING",
+    "possible": "possible",
+    "included": "in the model",
+    "not_excited": "not excited",
+    "not_supported": "not supported",
+}
+
+
+def percent(share: float) -> str:
+    """A share as people read it: 71 %, 0.4 %."""
+    return f"{100 * share:.0f} %" if share >= 0.01 or share == 0.0 else f"{100 * share:.1f} %"
+
+
+def print_comparisons(console: Console, comparisons: Sequence[Comparison]) -> None:
+    """Residual per axis and open-loop error, one row a model."""
+    first = comparisons[0]
+    table = Table(
+        title=f"{first.flight.name}: measured minus predicted acceleration, RMS in m/s², heading frame, "
+        f"below {first.bandwidth:g} Hz",
+        title_justify="left",
+    )
+    table.add_column("model")
+    for a in first.axes:
+        table.add_column(a.axis, justify="right")
+        table.add_column("explained", justify="right")
+    if first.horizons:
+        for h in first.horizons:
+            table.add_column(f"position after\n{h.horizon:g} s open loop", justify="right")
+    for c in comparisons:
+        cells = [c.label]
+        for a in c.axes:
+            cells += [f"{a.rms:.3f}", percent(a.share_explained)]
+        cells += [f"{100 * sum(x * x for x in h.position) ** 0.5:.1f} cm" for h in c.horizons]
+        table.add_row(*cells)
+    cells = ["noise floor"]
+    for a in first.axes:
+        cells += [f"{a.noise_floor:.3f}", ""]
+    table.add_row(*cells, *([""] * len(first.horizons)), style="dim")
+    console.print(table)
+    share = float(first.used.mean())
+    if share < 0.95:
+        console.print(
+            f"{percent(share)} of the samples count; in the others the collective command does not tell the thrust.",
+            style="dim",
+        )
+    for note in first.flight.notes:
+        console.print(f"note: {note}", style="dim")
+
+
+def print_where(console: Console, where: WhereItFails) -> None:
+    """The regions that hold the error, and the worst moments."""
+    console.print(Text("Where it fails", style="bold"))
+    if not where.regions:
+        console.print("  evenly: no region holds much more than its share of the error")
+    for region in where.regions:
+        console.print(f"  {region.text}")
+    if where.worst:
+        console.print(Text("Worst moments", style="bold"))
+    for moment in where.worst[:3]:
+        console.print(f"  {moment.start:6.1f} to {moment.end:.1f} s  {moment.rms:.2f} m/s²  {moment.text}")
+
+
+def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) -> None:
+    """The ranking of effects, and the residual before and after."""
+    table = Table(title=f"{d.flight.name}: which effect is missing", title_justify="left")
+    table.add_column("effect", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    table.add_column("share of\nerror", justify="right")
+    table.add_column("parameters, 95 % interval")
+    for e in d.effects:
+        if e.verdict == "included" and not everything:
+            continue
+        table.add_row(
+            e.name,
+            Text(SAID[e.verdict], style=VERDICT_STYLE[e.verdict]),
+            percent(e.variance_share) if e.rank else "",
+            _parameters(e) if e.verdict in ("missing", "possible") or everything else Text(_shown(e), style="dim"),
+        )
+    console.print(table)
+    line = f"residual {d.rms_before:.3f} -> {d.rms_after:.3f} m/s² (noise floor {d.noise_floor:.3f})"
+    if d.validation_before is not None and d.validation_after is not None:
+        line += f"; held-out flight {d.validation_before:.3f} -> {d.validation_after:.3f} m/s²"
+    console.print(Text(line, style="bold"))
+    if d.unexplained.verdict:
+        console.print(
+            f"Unexplained: {percent(d.unexplained.variance_share)} of what is left can be predicted but fits no known "
+            f"effect: {'; '.join(d.unexplained.where)}",
+            style="yellow",
+        )
+    for e in d.effects:
+        if e.verdict in ("missing", "possible"):
+            console.print(f"{e.name}: {e.advice}")
+
+
+def _parameters(e: EffectVerdict) -> str:
+    return "\n".join(f"{p.name} = {p.value:.3g} {_unit(p.unit)}  [{p.low:.3g}, {p.high:.3g}]" for p in e.parameters)
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else unit
+
+
+def _shown(e: EffectVerdict) -> str:
+    if e.verdict == "not_excited":
+        return e.advice
+    return ", ".join(f"{p.name} within [{p.low:.3g}, {p.high:.3g}] {_unit(p.unit)}".strip() for p in e.parameters)
+
+
+def print_waterfall(console: Console, steps: Sequence[WaterfallStep], fitted: str, held_out: str | None) -> None:
+    """The error falling over the model versions, with bars."""
+    table = Table(title="residual RMS in m/s² as effects are added", title_justify="left")
+    table.add_column("model")
+    table.add_column(f"fitted: {fitted}", justify="right")
+    if held_out:
+        table.add_column(f"held out: {held_out}", justify="right")
+    table.add_column("")
+    most = max(s.fitted for s in steps)
+    for s in steps:
+        cells = [s.label, f"{s.fitted:.3f}"]
+        if held_out:
+            cells.append("" if s.held_out is None else f"{s.held_out:.3f}")
+        table.add_row(*cells, Text("█" * max(1, round(30 * s.fitted / most)), style="red"))
+    cells = ["noise floor", f"{steps[-1].noise_floor:.3f}"] + ([""] if held_out else [])
+    table.add_row(*cells, Text("█" * round(30 * steps[-1].noise_floor / most), style="dim"), style="dim")
+    console.print(table)
