@@ -1,0 +1,1 @@
+"""The simulated vehicle on MAVLink, as PX4 speaks it."""
