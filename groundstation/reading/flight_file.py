@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,9 +27,10 @@ def read_flight(
     """Read a flight: the project's CSV or Parquet, any table through a column `mapping`, MCAP record or PX4
     ULog.
 
-    `vehicle` is a vehicle or its file; without it `vehicle.toml` beside the flight is taken (a record of the
-    companion carries its own). A mapping `NAME.mapping.toml` or `mapping.toml` beside a table is taken by
-    itself. Raises `InputError`, in one line, for whatever makes the file unfit for analysis.
+    `vehicle` is a vehicle or its file; without it the one beside the flight is taken (a record of the
+    companion carries its own): `NAME.vehicle.toml` with the longest NAME that the flight's name starts with,
+    or `vehicle.toml`. A mapping is found in the same way (`NAME.mapping.toml`, `mapping.toml`). Raises
+    `InputError`, in one line, for whatever makes the file unfit for analysis.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -39,7 +39,7 @@ def read_flight(
     if suffix in RECORDS:
         from groundstation.reading.flight_record import read_flight_record
 
-        return read_flight_record(path, vehicle if vehicle is not None else _vehicle_beside(path))
+        return read_flight_record(path, vehicle)
     if suffix in ULOGS:
         from groundstation.reading.ulog import read_ulog
 
@@ -82,6 +82,7 @@ def assemble(
     *,
     extra: dict[str, np.ndarray] | None = None,
     flying: np.ndarray | None = None,
+    commanded: np.ndarray | None = None,
     notes: tuple[str, ...] = (),
 ) -> Flight:
     """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
@@ -95,6 +96,8 @@ def assemble(
     every = {**columns, **{f"extra {k}": v for k, v in (extra or {}).items()}}
     if flying is not None:
         every["flying"] = np.asarray(flying, dtype=bool)
+    if commanded is not None:
+        every["commanded"] = np.asarray(commanded, dtype=bool)
     t, every, more = plausible.without_duplicates(t, every)
     said += more
     given = {name: every[name] for name in names}
@@ -114,6 +117,8 @@ def assemble(
         given["thrust_command"] = given["motor_command"].mean(axis=1)
         said.append("no collective command in the log: thrust_command is the mean of the motor commands")
     in_air = every["flying"] if flying is not None else flying_mask(t, given, vehicle)
+    if commanded is not None:
+        in_air = in_air & every["commanded"]
     dt = float(np.median(np.diff(t)))
     seconds = float(in_air.sum()) * dt
     if seconds < plausible.SHORTEST:
@@ -125,7 +130,7 @@ def assemble(
         first, last = t[in_air][0], t[in_air][-1]
         said.append(
             f"{seconds:.1f} s of {t[-1] - t[0]:.1f} s are in the air, from t = {first:.1f} to {last:.1f} "
-            "s; the rest "
+            "s; the "
             "(ground, takeoff, landing) is left out"
         )
     plausible.check_specific_force(given, in_air, origin)
@@ -167,7 +172,7 @@ def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:
         return vehicle
     if vehicle is not None:
         return load_vehicle(vehicle)
-    if (beside := _vehicle_beside(path)) is not None:
+    if (beside := _beside(path, "vehicle.toml")) is not None:
         return load_vehicle(beside)
     raise InputError(
         f"{path}: no vehicle.toml beside it; pass --vehicle FILE (mass, hover_thrust and rotors as you "
@@ -175,26 +180,18 @@ def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:
     )
 
 
-def _vehicle_beside(path: Path) -> Path | None:
-    candidates = (path.with_suffix(".vehicle.toml"), path.parent / "vehicle.toml")
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+def _beside(path: Path, kind: str) -> Path | None:
+    """The file that goes with a flight: of the files `NAME.kind` in its directory the one with the longest
+    NAME that the flight's name starts with, otherwise `kind` alone."""
+    fitting = [
+        f for f in path.parent.glob(f"*.{kind}") if path.stem.startswith(f.name.removesuffix(f".{kind}"))
+    ]
+    alone = path.parent / kind
+    return max(fitting, key=lambda f: len(f.name)) if fitting else (alone if alone.is_file() else None)
 
 
 def _mapping_beside(path: Path, table: Table) -> Path | None:
     """The mapping beside a table that is not in the project's own format."""
     if "t" in table.columns and ("thrust_command" in table.columns or "motor_command_1" in table.columns):
         return None
-    for beside in (path.with_suffix(".mapping.toml"), path.parent / "mapping.toml"):
-        if beside.is_file():
-            return beside
-    return None
-
-
-def read_toml(path: Path, what: str) -> dict[str, object]:
-    """A TOML file's table. Raises `InputError` for a missing file or a syntax error."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the {what} ({error.strerror}); check the path") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}; correct that line") from None
+    return _beside(path, "mapping.toml")

@@ -1,0 +1,82 @@
+"""Flight records of our own companion (MCAP), whole or cut short by a power cut."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from models.errors import InputError
+from models.flight import COLUMNS, Flight
+from models.record import FlightRecord, read_record
+from models.vehicle import Vehicle, load_vehicle
+
+COMMANDED = ("takeoff", "mission", "landing")
+"""Phases in which the companion's own command flies the vehicle."""
+
+KEPT = (
+    "feedback_thrust",
+    "feedback_body_rate",
+    "correction",
+    "correction_raw",
+    "latency",
+    "inference",
+    "interval",
+)
+
+
+def read_flight_record(path: Path, vehicle: str | Path | Vehicle | None = None) -> Flight:
+    """The flight of a record. The vehicle is that of the record unless one is given.
+
+    Only what the companion itself commanded, in the air, counts as flying. Words of each tick stand as
+    numbers in `extra`: `mission` (1 while the trajectory was flown) and `corrected` (1 while the guard let a
+    correction act). Raises `InputError` for a record without a vehicle, a flight, or any plausible column.
+    """
+    from groundstation.reading.flight_file import assemble
+
+    record = read_record(path)
+    believed = _vehicle(path, record, vehicle)
+    ticks = record.ticks
+    columns = {name: ticks[name] for name in COLUMNS if name in ticks and not _unknown(ticks[name])}
+    if "battery_voltage" in columns and not np.any(columns["battery_voltage"] > 0):
+        del columns["battery_voltage"]
+    commanded = np.isin(ticks["phase"], COMMANDED) & ticks["armed"] & ticks["setpoint_sent"]
+    extra = {name: ticks[name] for name in KEPT if name in ticks and not _unknown(ticks[name])}
+    extra["mission"] = (ticks["phase"] == "mission").astype(float)
+    extra["corrected"] = np.array(
+        [not word.startswith(("off", "tripped")) for word in ticks["guard"]], dtype=float
+    )
+    extra["commanded"] = commanded.astype(float)
+    t = ticks["t"]
+    if not np.any(commanded):
+        raise InputError(
+            f"{path}: the companion never flew in this record (phases: "
+            f"{', '.join(sorted(set(ticks['phase'])))}); "
+            "take another one (`groundstation flights DIR`)"
+        )
+    return assemble(
+        path,
+        believed,
+        t,
+        columns,
+        lambda row: f"{path}, tick {row + 1}",
+        extra=extra,
+        commanded=commanded,
+        notes=record.notes,
+    )
+
+
+def _vehicle(path: Path, record: FlightRecord, vehicle: str | Path | Vehicle | None) -> Vehicle:
+    if isinstance(vehicle, Vehicle):
+        return vehicle
+    if vehicle is not None:
+        return load_vehicle(vehicle)
+    if record.vehicle is None:
+        raise InputError(f"{path}: the record holds no vehicle; pass --vehicle FILE")
+    return record.vehicle
+
+
+def _unknown(column: np.ndarray) -> bool:
+    """Whether a column holds nothing, or nothing in most ticks."""
+    finite = np.isfinite(column if column.ndim == 1 else column.sum(axis=1))
+    return bool(finite.mean() < 0.5)

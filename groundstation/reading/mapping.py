@@ -1,0 +1,266 @@
+"""Foreign tables through a column mapping: which column is what, in which unit and frame.
+
+A mapping is a TOML file with one table for each quantity:
+
+    frame = "ned_frd"            # of the whole file; "enu_flu" unless told otherwise
+    [time]
+    column = "timestamp"
+    unit = "us"
+    [quaternion]
+    columns = ["qx", "qy", "qz", "qw"]
+    order = "xyzw"               # w, x, y, z unless told otherwise
+    [thrust_command]
+    column = "thrust_N"
+    unit = "N"                   # through mass, hover_thrust and thrust_model of the vehicle file
+
+Quantities are the attributes of `Flight` (`models.flight.COLUMNS`), and
+* `[attitude]`: `roll`, `pitch`, `yaw` name columns of Z-Y-X angles, instead of a quaternion. A log without
+  pitch says `pitch = "from_acceleration"`: the pitch that explains the forward world acceleration by thrust
+  alone. The x axis then agrees with any model by construction; height and roll stay measured.
+* `[world_acceleration]`: kinematic acceleration in the world, gravity not in it; it becomes the specific
+  force through the attitude.
+
+Each takes `unit`, `sign` (a number, or one for each column), `frame`; a quaternion also `order` and
+`inverse = true` where it turns world into body.
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from groundstation.reading.table import Table
+from groundstation.reading.toml_file import read_toml
+from models.errors import InputError
+from models.flight import COLUMNS
+from models.frames import (
+    enu_flu_from_ned_frd,
+    enu_from_ned,
+    flu_from_frd,
+    heading_from_world,
+    quaternion_from_euler,
+    rotate_inverse,
+)
+from models.vehicle import GRAVITY, Vehicle
+
+FRAMES = ("enu_flu", "ned_frd")
+
+UNITS: dict[str, dict[str, tuple[float, float]]] = {
+    # unit of the project: {unit in the file: (factor, offset)}, value = factor * (read - offset)
+    "s": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "us": (1e-6, 0.0), "ns": (1e-9, 0.0)},
+    "m": {"m": (1.0, 0.0), "cm": (1e-2, 0.0), "mm": (1e-3, 0.0)},
+    "m/s": {"m/s": (1.0, 0.0), "cm/s": (1e-2, 0.0), "mm/s": (1e-3, 0.0), "km/h": (1 / 3.6, 0.0)},
+    "m/s^2": {"m/s^2": (1.0, 0.0), "g": (GRAVITY, 0.0), "mg": (1e-3 * GRAVITY, 0.0)},
+    "rad": {"rad": (1.0, 0.0), "deg": (np.pi / 180, 0.0), "cdeg": (np.pi / 18000, 0.0)},
+    "rad/s": {
+        "rad/s": (1.0, 0.0),
+        "deg/s": (np.pi / 180, 0.0),
+        "mdeg/s": (np.pi / 180000, 0.0),
+        "rpm": (np.pi / 30, 0.0),
+        "rev/s": (2 * np.pi, 0.0),
+    },
+    "V": {"V": (1.0, 0.0), "mV": (1e-3, 0.0)},
+    "1": {"1": (1.0, 0.0), "percent": (1e-2, 0.0), "u16": (1 / 65535, 0.0), "pwm": (1e-3, 1000.0)},
+}
+
+WORLD = ("position", "velocity", "position_reference", "velocity_reference", "acceleration_reference")
+BODY = ("angular_velocity", "specific_force", "body_rate_command")
+_KEYS = {"column", "columns", "unit", "sign", "frame"}
+_SPECIAL = {"time": "s", "attitude": "rad", "world_acceleration": "m/s^2"}
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """A mapping file as read: `quantities` by name, each with the keys of its table; `frame` of the file."""
+
+    source: str
+    frame: str
+    quantities: dict[str, dict[str, object]]
+
+
+@dataclass(frozen=True)
+class MappedTable:
+    """A foreign table in the project's names, units and frames; `extra` are the columns that nothing
+    claimed."""
+
+    t: np.ndarray
+    columns: dict[str, np.ndarray]
+    extra: dict[str, np.ndarray]
+    notes: tuple[str, ...]
+
+
+def load_mapping(path: Path) -> Mapping:
+    """Read and check a mapping file. Raises `InputError` with file and field for anything it does not
+    know."""
+    source, table = str(path), read_toml(path, "mapping")
+    frame = table.pop("frame", "enu_flu")
+    _one_of(source, "frame", frame, FRAMES)
+    known = [*COLUMNS, *_SPECIAL]
+    quantities: dict[str, dict[str, object]] = {}
+    for name, entry in table.items():
+        if name not in known:
+            raise InputError(f"{source}: unknown quantity '{name}'; {_suggestion(name, known)}")
+        if not isinstance(entry, dict):
+            raise InputError(f"{source}: '{name}' must be a table, [{name}] with column = \"...\"")
+        allowed = {"roll", "pitch", "yaw", "unit", "sign", "frame"} if name == "attitude" else set(_KEYS)
+        if name == "quaternion":
+            allowed |= {"order", "inverse"}
+        for key in entry:
+            if key not in allowed:
+                hint = _suggestion(key, sorted(allowed))
+                raise InputError(f"{source}: [{name}] has an unknown key '{key}'; {hint}")
+        _one_of(source, f"[{name}] frame", entry.get("frame", frame), FRAMES)
+        quantities[name] = entry
+    if "time" not in quantities:
+        raise InputError(f'{source}: [time] is missing; add it with column = "..." and unit = "s"')
+    return Mapping(source, str(frame), quantities)
+
+
+def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTable:
+    """Translate a table. Raises `InputError` for a column that is not there or a unit that does not fit."""
+    used: set[str] = set()
+    columns: dict[str, np.ndarray] = {}
+    notes: list[str] = []
+    t = _quantity(table, mapping, "time", vehicle, used, 1, "s")
+    for name in mapping.quantities:
+        if name not in COLUMNS:
+            continue
+        names, unit, _ = COLUMNS[name]
+        values = _quantity(table, mapping, name, vehicle, used, len(names), unit)
+        columns[name] = _in_frame(mapping, name, values)
+    world = None
+    if "world_acceleration" in mapping.quantities:
+        values = _quantity(table, mapping, "world_acceleration", vehicle, used, 3, "m/s^2")
+        world = enu_from_ned(values) if _frame(mapping, "world_acceleration") == "ned_frd" else values
+    if "attitude" in mapping.quantities:
+        columns["quaternion"], said = _attitude(table, mapping, world, used)
+        notes += said
+    if world is not None:
+        if "quaternion" not in columns:
+            raise InputError(
+                f"{mapping.source}: [world_acceleration] needs an attitude to become a specific force; "
+                "map [quaternion] or [attitude] as well"
+            )
+        columns["specific_force"] = rotate_inverse(
+            columns["quaternion"], world + np.array([0.0, 0.0, GRAVITY])
+        )
+        notes.append("the specific force is the logged world acceleration plus gravity, in body axes")
+    extra = {name: column for name, column in table.columns.items() if name not in used}
+    return MappedTable(t - t[0], columns, extra, tuple(notes))
+
+
+def _quantity(
+    table: Table, mapping: Mapping, name: str, vehicle: Vehicle, used: set[str], count: int, unit: str
+) -> np.ndarray:
+    """Values (N,) or (N, count) of one quantity in the project's unit, not yet turned into its frame."""
+    entry = mapping.quantities[name]
+    names = entry.get("columns", entry.get("column"))
+    names = [names] if isinstance(names, str) else names
+    if not isinstance(names, list) or len(names) != count or not all(isinstance(n, str) for n in names):
+        what = 'column = "..."' if count == 1 else f"columns = [...] with {count} names"
+        raise InputError(f"{mapping.source}: [{name}] needs {what}, it has {names!r}")
+    used.update(names)
+    read = [table.column(n, f" for [{name}] of {mapping.source}") for n in names]
+    values = read[0].copy() if count == 1 else np.stack(read, -1)
+    values = values * _signs(mapping.source, name, entry.get("sign", 1), count)
+    given = entry.get("unit", unit)
+    if name == "thrust_command" and given == "N":
+        ratio = values / vehicle.weight
+        if vehicle.thrust_model == "quadratic":
+            ratio = np.sign(ratio) * np.sqrt(np.abs(ratio))
+        return vehicle.hover_thrust * ratio
+    factor, offset = _unit(mapping.source, name, given, unit)
+    return factor * (values - offset)
+
+
+def _attitude(
+    table: Table, mapping: Mapping, world: np.ndarray | None, used: set[str]
+) -> tuple[np.ndarray, list[str]]:
+    entry, source = mapping.quantities["attitude"], mapping.source
+    notes: list[str] = []
+    factor, _ = _unit(source, "attitude", entry.get("unit", "rad"), "rad")
+    signs = np.broadcast_to(_signs(source, "attitude", entry.get("sign", 1), 3), (3,))
+    angles: dict[str, np.ndarray] = {}
+    for axis, sign in zip(("roll", "pitch", "yaw"), signs, strict=True):
+        name = entry.get(axis)
+        if axis == "pitch" and name == "from_acceleration":
+            continue
+        if not isinstance(name, str):
+            raise InputError(f'{source}: [attitude] needs {axis} = "column", it has {name!r}')
+        used.add(name)
+        angles[axis] = sign * factor * table.column(name, f" for [attitude] of {source}")
+        high = float(np.nanquantile(np.abs(angles[axis]), 0.99)) if axis != "yaw" else 0.0
+        if high > 2 * np.pi:
+            raise InputError(
+                f"{table.origin}: {axis} in '{name}' reaches {high:.0f} rad; is it in degrees? "
+                f'Set unit = "deg" in [attitude] of {source}'
+            )
+    if "pitch" not in angles:
+        if world is None:
+            raise InputError(
+                f'{source}: pitch = "from_acceleration" needs [world_acceleration]; map it, or name a '
+                "pitch column"
+            )
+        forward = heading_from_world(world, angles["yaw"])
+        angles["pitch"] = np.arctan2(forward[:, 0], np.maximum(forward[:, 2] + GRAVITY, 1e-3))
+        notes.append("pitch is not logged: taken from the forward acceleration, so the x axis shows no error")
+    quaternion = quaternion_from_euler(np.stack([angles[a] for a in ("roll", "pitch", "yaw")], -1))
+    if _frame(mapping, "attitude") == "ned_frd":
+        quaternion = enu_flu_from_ned_frd(quaternion)
+    return quaternion, notes
+
+
+def _in_frame(mapping: Mapping, name: str, values: np.ndarray) -> np.ndarray:
+    """Values of one quantity in world ENU or body FLU, quaternions as w, x, y, z body to world."""
+    ned = _frame(mapping, name) == "ned_frd"
+    if name == "quaternion":
+        entry = mapping.quantities[name]
+        order = entry.get("order", "wxyz")
+        _one_of(mapping.source, "[quaternion] order", order, ("wxyz", "xyzw"))
+        values = values[:, [3, 0, 1, 2]] if order == "xyzw" else values
+        values = values * [1.0, -1.0, -1.0, -1.0] if entry.get("inverse", False) else values
+        return enu_flu_from_ned_frd(values) if ned else values
+    if ned and name in WORLD:
+        return enu_from_ned(values)
+    if ned and name in BODY:
+        return flu_from_frd(values)
+    if ned and name == "yaw_reference":
+        return np.pi / 2 - values
+    return values
+
+
+def _frame(mapping: Mapping, name: str) -> str:
+    return str(mapping.quantities[name].get("frame", mapping.frame))
+
+
+def _unit(source: str, name: str, given: object, wanted: str) -> tuple[float, float]:
+    units = UNITS[wanted]
+    if given not in units:
+        choices = [*units, "N"] if name == "thrust_command" else [*units]
+        raise InputError(f"{source}: [{name}] unit is {given!r}; it must be one of {', '.join(choices)}")
+    return units[str(given)]
+
+
+def _signs(source: str, name: str, given: object, count: int) -> np.ndarray:
+    try:
+        signs = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        signs = np.zeros(1)
+    if signs.shape not in ((), (count,)) or not np.all(np.abs(signs) == 1):
+        raise InputError(
+            f"{source}: [{name}] sign must be 1 or -1, or a list of {count} of them, not {given!r}"
+        )
+    return signs
+
+
+def _one_of(source: str, key: str, given: object, choices: tuple[str, ...]) -> None:
+    if given not in choices:
+        raise InputError(f"{source}: {key} is {given!r}; it must be one of {', '.join(choices)}")
+
+
+def _suggestion(word: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(word, known, 1)
+    return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
