@@ -88,6 +88,10 @@ class ControlStep(NamedTuple):
     thrust_command: float
 
 
+IDLE_STEP = ControlStep(Command(0.0, ZERO), ZERO, ZERO, Command(0.0, ZERO), 0.0)
+"""No thrust and no rates: what is streamed on the ground before arming."""
+
+
 def euler(quaternion: tuple[float, float, float, float]) -> Vector:
     """Roll, pitch, yaw in rad (Z-Y-X) of a unit quaternion w, x, y, z; as `models.frames`, for one sample."""
     w, x, y, z = quaternion

@@ -1,0 +1,157 @@
+"""The companion put together: the wire, the control loop, the record, Zenoh."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from companion.control import ControlLaw
+from companion.director import Director
+from companion.flight import Flight
+from companion.settings import Settings
+from companion.store import ModelStore
+from companion.telemetry import Telemetry, make_event, read_json
+from companion.tick import make_tick
+from companion.vehicle_link import Odometry, VehicleLink
+from companion.zenoh_session import open_session
+from models.design import load_design
+from models.errors import InputError
+from models.vehicle import load_vehicle
+
+_RATE_TRIES = 10
+_SWITCH_INTERVAL = 0.0005
+
+
+class Companion:
+    """Everything of one run of the companion.
+
+    Building it connects and measures; it raises `InputError` where nothing can be flown (no autopilot, rates
+    too low, port in use, files that do not fit). `run` flies missions until `stop`.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        settings = settings.checked()
+        vehicle = load_vehicle(settings.vehicle)
+        design = load_design(settings.design_path, vehicle)
+        law = ControlLaw(vehicle, design, settings.limits)
+        records = Path(settings.records)
+        for folder in (records, Path(settings.models)):
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(f"{folder}: cannot make the folder ({error.strerror})") from None
+        store = ModelStore(Path(settings.models), vehicle, settings.guard.deadline)
+        session = open_session(settings.zenoh)
+        try:
+            self.link = VehicleLink(settings.connect, settings.timeout)
+        except InputError:
+            session.close()
+            raise
+        self.flight = Flight(law, settings.safety, self.emit)
+        self.director = Director(
+            self.link,
+            self.flight,
+            vehicle,
+            design,
+            store,
+            settings.safety,
+            settings.guard,
+            records,
+            settings.rate,
+            self.emit,
+        )
+        self._vehicle_time_us = 0
+        self._errors_told = 0
+        self.telemetry = Telemetry(
+            session,
+            vehicle.name,
+            {
+                "status": lambda payload: self.director.status(),
+                "mission": lambda payload: self.director.request(read_json(payload)),
+                "model": self._model,
+            },
+            records,
+        )
+        for reason in store.refused_at_start:
+            self.emit("warning", "model_refused", f"no longer accepted: {reason}")
+        self.link.on_odometry = self._control
+        self.link.on_error = self._wire_error
+        try:
+            self._settle_rates(settings.rate)
+        except InputError:
+            self.close()
+            raise
+
+    def run(self) -> None:
+        """Fly missions until `stop`; the calling thread must be the one that may block."""
+        # The control thread allocates no cycles; without this a collection of somebody else's could take 10 ms.
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        # How long another Python thread may keep the control thread from running.
+        sys.setswitchinterval(_SWITCH_INTERVAL)
+        self.director.run()
+
+    def stop(self) -> None:
+        """Land what is in the air and let `run` return; safe from a signal handler."""
+        self.director.stopping.set()
+
+    def close(self) -> None:
+        """Disconnect from vehicle and ground."""
+        self.link.on_odometry = lambda odometry: None
+        self.link.close()
+        self.telemetry.close()
+
+    def emit(self, level: str, kind: str, text: str) -> None:
+        """Tell an event to the ground and to the record; any thread, never blocks."""
+        event = make_event(level, kind, text, self._vehicle_time_us)
+        self.telemetry.event(event)
+        recorder = self.director.recorder
+        if recorder is not None:
+            recorder.event(event)
+
+    def _control(self, odometry: Odometry) -> None:
+        """The control loop: one odometry message in, at most one setpoint out, then the book-keeping."""
+        latest = self.link.latest
+        outcome = self.flight.tick(odometry, latest)
+        step = outcome.step
+        if step is not None:
+            self.link.send_rates(odometry.vehicle_time_us, step.thrust_command, step.command.body_rate)
+        latency = 1e-9 * (time.monotonic_ns() - odometry.host_time_ns)
+        self._vehicle_time_us = odometry.vehicle_time_us
+        data = make_tick(odometry, latest, outcome, latency).SerializeToString()
+        recorder = self.director.recorder
+        if recorder is not None:
+            recorder.tick(data, odometry.vehicle_time_us, odometry.host_time_ns)
+        self.telemetry.tick(data)
+
+    def _wire_error(self, text: str) -> None:
+        self._errors_told += 1
+        if self._errors_told <= 5:
+            self.emit("warning", "malformed_message", text)
+
+    def _model(self, payload: bytes) -> dict[str, Any]:
+        if payload[:1] != b"{":
+            return self.director.deploy(payload)
+        command = read_json(payload).get("command")
+        if command == "list":
+            return {"accepted": True, "reason": "", **self.director.store.describe()}
+        if command == "rollback":
+            return self.director.roll_back()
+        return {
+            "accepted": False,
+            "reason": f"unknown command {command!r}; send list, rollback or an ONNX file",
+        }
+
+    def _settle_rates(self, rate: float) -> None:
+        """Ask for rates until they arrive; an autopilot that has just started takes a moment."""
+        for _ in range(_RATE_TRIES):
+            self.link.request_rates(rate)
+            self.director.rates = self.link.measure(1.0)
+            reason = self.director.rates_too_low(self.director.rates)
+            if not reason:
+                return
+        raise InputError(f"{self.link.address}: {reason}")

@@ -1,0 +1,203 @@
+"""`companion`: flies a vehicle by its linear design and lets the ground compare, correct and fly again."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from models.errors import run_command_line
+
+app = typer.Typer(
+    name="companion",
+    help="Runs on the vehicle: flies missions over MAVLink, records them, and answers the ground over Zenoh.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+Connect = Annotated[
+    str | None,
+    typer.Option(help="MAVSDK address of the autopilot, such as udpin://127.0.0.1:14540 or serial://..."),
+]
+Rate = Annotated[float | None, typer.Option(help="Control rate, Hz: the odometry's.")]
+Timeout = Annotated[float | None, typer.Option(help="Seconds to wait for an autopilot.")]
+
+
+@app.command(epilog="Example: companion run --vehicle models/vehicles/quad5/vehicle.toml --rate 100")
+def run(
+    vehicle: Annotated[Path | None, typer.Option(help="Vehicle file (vehicle.toml).")] = None,
+    design: Annotated[
+        Path | None, typer.Option(help="Design file; otherwise design.json beside the vehicle.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Configuration (companion.toml); flags override it.")
+    ] = None,
+    connect: Connect = None,
+    rate: Rate = None,
+    timeout: Timeout = None,
+    records: Annotated[Path | None, typer.Option(help="Folder of the flight records.")] = None,
+    models: Annotated[Path | None, typer.Option(help="Folder of the deployed models.")] = None,
+    zenoh_mode: Annotated[
+        str | None, typer.Option("-m", "--mode", help="Zenoh mode: peer, client, router.")
+    ] = None,
+    zenoh_connect: Annotated[
+        list[str] | None, typer.Option("-e", "--zenoh-connect", help="Zenoh endpoint.")
+    ] = None,
+    zenoh_listen: Annotated[
+        list[str] | None, typer.Option("-l", "--listen", help="Zenoh endpoint to listen on.")
+    ] = None,
+    zenoh_config: Annotated[
+        Path | None, typer.Option("-c", "--zenoh-config", help="Zenoh configuration file.")
+    ] = None,
+    zenoh_cfg: Annotated[list[str] | None, typer.Option("--cfg", help="Zenoh setting, KEY:VALUE.")] = None,
+) -> None:
+    """Connect, wait for missions, fly them.
+
+    Prints one line `ready: ...` when it can take missions. On SIGINT or SIGTERM it asks the autopilot to
+    land, falls silent once that has taken over, closes the record and exits; a second signal ends it at once,
+    and then the autopilot's offboard-loss failsafe is what lands the vehicle.
+    """
+    from companion.app import Companion
+    from companion.settings import load_settings
+
+    settings = load_settings(config)
+    given: dict[str, Any] = {
+        "vehicle": vehicle,
+        "design": design,
+        "connect": connect,
+        "rate": rate,
+        "timeout": timeout,
+        "records": records,
+        "models": models,
+    }
+    flags: dict[str, Any] = {
+        name: value if isinstance(value, float) else str(value)
+        for name, value in given.items()
+        if value is not None
+    }
+    zenoh: dict[str, Any] = {
+        "mode": zenoh_mode,
+        "connect": tuple(zenoh_connect) if zenoh_connect else None,
+        "listen": tuple(zenoh_listen) if zenoh_listen else None,
+        "config": str(zenoh_config) if zenoh_config else None,
+        "cfg": tuple(zenoh_cfg) if zenoh_cfg else None,
+    }
+    if zenoh_config and not zenoh_listen:
+        zenoh["listen"] = ()  # what the file says, not our default
+    changes = {name: value for name, value in zenoh.items() if value is not None}
+    settings = replace(settings, **flags, zenoh=replace(settings.zenoh, **changes))
+
+    companion = Companion(settings)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if companion.director.stopping.is_set():
+            os._exit(128 + number)
+        companion.stop()
+
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    rates = companion.director.rates
+    assert rates is not None
+    where = ", ".join(settings.zenoh.listen) or settings.zenoh.config or "Zenoh"
+    typer.echo(
+        f"ready: {companion.director.vehicle.name} at {rates.odometry:.0f} Hz on {settings.connect}, "
+        f"missions on {where}"
+    )
+    sys.stdout.flush()
+    try:
+        companion.run()
+    finally:
+        companion.close()
+
+
+@app.command(epilog="Example: companion check --connect udpin://127.0.0.1:14540 --json")
+def check(connect: Connect = None, rate: Rate = None, timeout: Timeout = None, as_json: Json = False) -> None:
+    """Connect and tell what arrives: rates, mode, battery, and the parameters that decide what happens in
+    trouble.
+    """
+    from companion.settings import Settings
+    from companion.vehicle_link import VehicleLink
+
+    defaults = Settings()
+    link = VehicleLink(connect or defaults.connect, timeout if timeout is not None else defaults.timeout)
+    try:
+        wanted = rate if rate is not None else defaults.rate
+        link.request_rates(wanted)
+        link.measure(0.5)  # the new rates take a moment
+        rates = link.measure(2.0)
+        names = ("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_RC_IN_MODE", "EKF2_PREDICT_US")
+        report: dict[str, Any] = {
+            "address": link.address,
+            "wanted_rate": wanted,
+            "rates": asdict(rates),
+            "flight_mode": link.latest.flight_mode,
+            "armed": link.latest.armed,
+            "landed": link.latest.landed,
+            "battery_voltage": link.latest.battery_voltage,
+            "rotor_speeds": len(link.latest.rotor_speed),
+            "accelerometer": link.latest.specific_force is not None,
+            "parameters": {name: link.parameter(name) for name in names},
+            "malformed_messages": link.malformed,
+        }
+    finally:
+        link.close()
+    if as_json:
+        typer.echo(json.dumps(report))
+        return
+    table = Table("", "", show_header=False)
+    for key, value in report.items():
+        if isinstance(value, dict):
+            value = ", ".join(
+                f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in value.items()
+            )
+        table.add_row(key.replace("_", " "), escape(str(value)))
+    Console().print(table)
+
+
+@app.command(epilog="Example: companion trajectories --json")
+def trajectories(as_json: Json = False) -> None:
+    """List the trajectories that can be flown by name, with their parameters."""
+    from models.reference import KINDS
+
+    if as_json:
+        listing = {
+            name: {
+                "text": kind.text,
+                "parameters": {p.name: {"default": p.default, "unit": p.unit} for p in kind.parameters},
+            }
+            for name, kind in KINDS.items()
+        }
+        typer.echo(json.dumps(listing))
+        return
+    table = Table("trajectory", "what it does", "parameters")
+    for name, kind in KINDS.items():
+        parameters = [
+            f"{p.name} {p.default:g} {p.unit}".strip()
+            if isinstance(p.default, float)
+            else f"{p.name} {p.default}"
+            for p in kind.parameters
+        ]
+        table.add_row(name, kind.text, escape(", ".join(parameters)))
+    Console().print(table)
+
+
+def main() -> None:
+    """Entry point: bad input becomes one line and exit code 2."""
+    run_command_line(app)
+
+
+if __name__ == "__main__":
+    main()

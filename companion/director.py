@@ -1,0 +1,355 @@
+"""What happens around a flight: checks, mode changes, arming, the queue of missions, the record, the status.
+
+Everything here may block and runs on the main thread or the service thread; the control thread only ever
+looks at `Flight`. Answers to the ground are dictionaries with `accepted` and `reason`.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from companion.flight import IDLE, LANDING, SILENT, TAKEOFF, Flight, Mission, Safety
+from companion.guard import Guard, GuardLimits
+from companion.store import ModelStore
+from companion.vehicle_link import Rates, VehicleLink
+from models.design import Design
+from models.errors import InputError
+from models.record import FlightRecorder
+from models.reference import KINDS, Trajectory, trajectory, trajectory_from_csv
+from models.vehicle import Vehicle
+
+QUEUE_LIMIT = 16
+_STREAM_BEFORE_OFFBOARD = 0.6  # s; PX4 wants to have heard setpoints for half a second
+_MODE_TIMEOUT, _ARM_TIMEOUT = 4.0, 5.0
+_LAND_RETRY, _LAND_TRIES = 1.0, 5
+_DISARM_AFTER = 3.0  # s on the ground after which we ask for what the autopilot should have done by itself
+_RATE_SHARE = 0.75
+_MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
+
+
+@dataclass
+class Progress:
+    """One mission on its way: queued, flying, finished, failed or aborted."""
+
+    mission: Mission
+    state: str = "queued"
+    reason: str = ""
+    record: str = ""
+
+
+@dataclass
+class Director:
+    """Brings missions into the air and back, one at a time; each flight has its own record.
+
+    `emit(level, kind, text)` tells an event to the ground and the record and must not block.
+    """
+
+    link: VehicleLink
+    flight: Flight
+    vehicle: Vehicle
+    design: Design
+    store: ModelStore
+    safety: Safety
+    guard_limits: GuardLimits
+    records: Path
+    rate: float
+    emit: Callable[[str, str, str], None]
+    recorder: FlightRecorder | None = None
+    rates: Rates | None = None
+    stopping: threading.Event = field(default_factory=threading.Event)
+    _queue: deque[Progress] = field(default_factory=deque)
+    _known: dict[str, Progress] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _number: int = 0
+
+    # Asked by the ground, on the service thread
+
+    def request(self, request: dict[str, Any]) -> dict[str, Any]:
+        """A mission or a command; never raises for what the ground sends."""
+        try:
+            if "command" in request:
+                return self._command(str(request["command"]))
+            return self._mission(request)
+        except InputError as error:
+            return {"accepted": False, "reason": str(error)}
+
+    def deploy(self, onnx: bytes) -> dict[str, Any]:
+        """Check a model and make it live; refused in flight, where the check would disturb the control loop."""
+        if self.flight.phase != IDLE:
+            return {"accepted": False, "reason": "a flight is under way; deploy after landing"}
+        answer = self.store.deploy(onnx)
+        kind = "model_accepted" if answer["accepted"] else "model_refused"
+        self.emit("info" if answer["accepted"] else "warning", kind, answer["reason"])
+        return answer
+
+    def roll_back(self) -> dict[str, Any]:
+        """Make the previous model live."""
+        if self.flight.phase != IDLE:
+            return {"accepted": False, "reason": "a flight is under way; roll back after landing"}
+        answer = self.store.roll_back()
+        if answer["accepted"]:
+            self.emit("info", "model_rolled_back", answer["reason"])
+        return answer
+
+    def status(self) -> dict[str, Any]:
+        """What the companion is doing, for JSON."""
+        latest, flight = self.link.latest, self.flight
+        with self._lock:
+            missions = [
+                {
+                    "mission": identity,
+                    "trajectory": progress.mission.trajectory.name,
+                    "controller": progress.mission.controller,
+                    "state": progress.state,
+                    "reason": progress.reason,
+                    "record": progress.record,
+                }
+                for identity, progress in self._known.items()
+            ]
+        rates = self.rates
+        mission = flight.mission if flight.phase != IDLE else None
+        return {
+            "accepted": True,
+            "reason": "",
+            "vehicle": self.vehicle.name,
+            "phase": flight.phase,
+            "flight_mode": latest.flight_mode,
+            "armed": latest.armed,
+            "landed": latest.landed,
+            "battery_voltage": round(latest.battery_voltage, 3),
+            "ready": not self.not_ready(),
+            "not_ready": self.not_ready(),
+            "mission": mission.identity if mission else "",
+            "guard": mission.guard.status if mission and mission.guard else "off",
+            "missions": missions,
+            "rates": {}
+            if rates is None
+            else {"odometry": round(rates.odometry, 1), "imu": round(rates.imu, 1)},
+            "recording": str(self.recorder.path) if self.recorder else "",
+            "malformed_messages": self.link.malformed,
+            **self.store.describe(),
+        }
+
+    def not_ready(self) -> str:
+        """'' where a mission could start now, otherwise the reason."""
+        if self.flight.phase != IDLE:
+            return f"a flight is under way ({self.flight.phase})"
+        latest = self.link.latest
+        if time.monotonic() - latest.heartbeat > 3.0:
+            return "the autopilot is silent"
+        if latest.armed:
+            return "the vehicle is armed by somebody else"
+        low = self.safety.takeoff_voltage * self.vehicle.nominal_voltage
+        if 0.0 < latest.battery_voltage < low:
+            return f"the battery has {latest.battery_voltage:.1f} V, a flight needs {low:.1f} V"
+        return self.rates_too_low(self.rates)
+
+    def rates_too_low(self, rates: Rates | None) -> str:
+        """'' where odometry and accelerometer arrive often enough, otherwise what is missing and what to do."""
+        if rates is None:
+            return "rates have not been measured yet"
+        if rates.odometry < _RATE_SHARE * self.rate:
+            return (
+                f"odometry arrives at {rates.odometry:.0f} Hz, {self.rate:.0f} Hz were asked for; lower --rate, "
+                "or let the autopilot send more (PX4: EKF2_PREDICT_US, the link's MAV_x_RATE)"
+            )
+        if rates.longest_gap > self.safety.odometry_gap:
+            return f"odometry had a gap of {rates.longest_gap:.2f} s; the link or this machine is too busy"
+        if rates.imu < 0.5 * min(self.rate, 100.0):
+            return f"HIGHRES_IMU arrives at {rates.imu:.0f} Hz; the link is too slow for it (PX4: MAV_x_RATE)"
+        return ""
+
+    def _command(self, command: str) -> dict[str, Any]:
+        if command not in ("abort", "land"):
+            return {"accepted": False, "reason": f"unknown command '{command}'; use abort or land"}
+        with self._lock:
+            waiting = len(self._queue)
+            for progress in self._queue:
+                progress.state, progress.reason = "aborted", f"{command} from the ground"
+            self._queue.clear()
+        if self.flight.phase == IDLE:
+            done = f"{waiting} queued missions dropped; nothing is flying"
+            return {"accepted": True, "reason": done}
+        self.flight.land(f"{command} from the ground", return_home=command == "land")
+        return {"accepted": True, "reason": "landing at home" if command == "land" else "landing where it is"}
+
+    def _mission(self, request: dict[str, Any]) -> dict[str, Any]:
+        for key in request:
+            if key not in _MISSION_KEYS:
+                raise InputError(f"unknown key '{key}' in the mission; known: {', '.join(_MISSION_KEYS)}")
+        path = _trajectory(request)
+        reason = self.safety.check_trajectory(path)
+        if reason:
+            raise InputError(f"trajectory '{path.name}': {reason}")
+        repeat = request.get("repeat", 1)
+        if type(repeat) is not int or not 1 <= repeat <= 100:
+            raise InputError(f"repeat must be a whole number from 1 to 100, not {repeat!r}")
+        if self.stopping.is_set():
+            raise InputError("the companion is shutting down")
+        if self.flight.phase == IDLE and self.not_ready():
+            raise InputError(self.not_ready())
+        controller = str(request.get("controller", "lqr"))
+        with self._lock:
+            if len(self._queue) >= QUEUE_LIMIT:
+                raise InputError(f"{QUEUE_LIMIT} missions are waiting already")
+            self._number += 1
+            mission = self._prepared(f"m{self._number}", path, controller, repeat)
+            progress = Progress(mission)
+            self._known[mission.identity] = progress
+            self._queue.append(progress)
+            ahead = len(self._queue) - 1
+            while len(self._known) > 4 * QUEUE_LIMIT:
+                self._known.pop(next(iter(self._known)))
+        return {
+            "accepted": True,
+            "reason": f"{ahead} missions before it" if ahead else "next",
+            "mission": mission.identity,
+            "duration": round(path.duration * repeat, 2),
+        }
+
+    def _prepared(self, identity: str, path: Trajectory, controller: str, repeat: int) -> Mission:
+        model = self.store.live if controller == "corrected" else None
+        if model is None:
+            return Mission(identity, path, controller, repeat)
+        info = model.info
+
+        def tripped(reason: str) -> None:
+            self.emit("warning", "guard_trip", f"correction {info.hash} switched off: {reason}")
+
+        guard = Guard(model, info.features, self.guard_limits, info.wants_yaw, tripped)
+        return Mission(identity, path, controller, repeat, guard, info.hash)
+
+    # The main thread
+
+    def run(self) -> None:
+        """Fly what is asked until `stopping` is set; then land what is in the air and return."""
+        while not self.stopping.wait(0.02):
+            with self._lock:
+                progress = self._queue.popleft() if self._queue else None
+            if progress is not None:
+                self._fly(progress)
+                gc.collect()  # automatic collection is off: the control thread must not pay for it
+
+    def _fly(self, progress: Progress) -> None:
+        mission = progress.mission
+        progress.state = "flying"
+        reason = self._check() or self._start(progress)
+        if reason:
+            self.flight.cancel(reason)
+            progress.state, progress.reason = "failed", reason
+            self.emit("error", "mission_failed", f"{mission.trajectory.name} not flown: {reason}")
+            self._stop_recording()
+            return
+        self._accompany()
+        outcome = self.flight.outcome
+        progress.state = "finished" if outcome == "finished" else "aborted"
+        progress.reason = outcome
+        self.emit("info", "mission_ended", f"{mission.trajectory.name}: {outcome}")
+        self._stop_recording()
+
+    def _check(self) -> str:
+        self.rates = self.link.measure(0.5)
+        return self.not_ready()
+
+    def _start(self, progress: Progress) -> str:
+        """Stream, Offboard, arm, go; '' or the reason why not."""
+        latest, flight = self.link.latest, self.flight
+        sent = flight.sent
+        flight.prepare(progress.mission)
+        time.sleep(_STREAM_BEFORE_OFFBOARD)
+        if flight.sent == sent:
+            return "no odometry, so no setpoint could be sent"
+        reason = self.link.set_mode("OFFBOARD")
+        if reason:
+            return f"the autopilot refused Offboard ({reason})"
+        if not self._wait(lambda: latest.flight_mode == "OFFBOARD", _MODE_TIMEOUT):
+            return f"the autopilot stayed in {latest.flight_mode}"
+        self._record(progress)
+        reason = self.link.arm()
+        if reason:
+            return f"the autopilot refused to arm ({reason})"
+        if not self._wait(lambda: latest.armed, _ARM_TIMEOUT):
+            return "the autopilot did not arm"
+        if latest.flight_mode != "OFFBOARD":
+            return f"the mode changed to {latest.flight_mode} while arming"
+        flight.take_off()
+        return "" if self._wait(lambda: flight.home_set, 1.0) else "no odometry after arming"
+
+    def _accompany(self) -> None:
+        """Do what the flight asks for that may block, until it is over."""
+        flight, latest = self.flight, self.link.latest
+        asked, tries, grounded = -math.inf, 0, math.inf
+        while flight.phase != IDLE:
+            time.sleep(0.02)
+            now = time.monotonic()
+            if self.stopping.is_set() and flight.phase not in (LANDING, SILENT):
+                flight.land("the companion is shutting down", return_home=False)
+            if flight.wants_land and latest.flight_mode == "OFFBOARD" and now - asked > _LAND_RETRY:
+                asked, tries = now, tries + 1
+                reason = self.link.set_mode("LAND")
+                if reason and tries >= _LAND_TRIES:
+                    flight.give_up(f"the autopilot refused Land ({reason})")
+            on_ground = latest.landed == "on ground" and flight.phase != TAKEOFF and not flight.sending
+            grounded = min(grounded, now) if on_ground else math.inf
+            if now - grounded > _DISARM_AFTER and latest.armed and flight.phase == LANDING:
+                self.link.disarm()
+                grounded = math.inf
+            if now - latest.heartbeat > 10.0:
+                flight.abandon("the autopilot fell silent in flight")
+
+    def _wait(self, condition: Callable[[], bool], timeout: float) -> bool:
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            time.sleep(0.01)
+        return True
+
+    def _record(self, progress: Progress) -> None:
+        mission = progress.mission
+        stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
+        name = f"{stamp}-{mission.identity}-{mission.trajectory.name}-{mission.controller}.mcap"
+        metadata = {
+            "mission": mission.identity,
+            "trajectory": mission.trajectory.name,
+            "controller": mission.controller,
+            "model": mission.model,
+            "repeat": str(mission.repeat),
+            **{f"parameter.{key}": str(value) for key, value in mission.trajectory.parameters.items()},
+        }
+        try:
+            self.recorder = FlightRecorder(self.records / name, self.vehicle, self.design, metadata)
+            progress.record = name
+        except InputError as error:
+            self.emit("error", "record_failed", str(error))
+
+    def _stop_recording(self) -> None:
+        recorder, self.recorder = self.recorder, None
+        if recorder is None:
+            return
+        recorder.close()
+        if recorder.dropped or recorder.error:
+            text = recorder.error or f"{recorder.dropped} messages missing in {recorder.path.name}"
+            self.emit("warning", "record_incomplete", text)
+
+
+def _trajectory(request: dict[str, Any]) -> Trajectory:
+    if "setpoints" in request:
+        if "trajectory" in request:
+            raise InputError("give either a trajectory or setpoints, not both")
+        return trajectory_from_csv(str(request["setpoints"]))
+    name, parameters = request.get("trajectory"), request.get("parameters", {})
+    if not isinstance(name, str):
+        raise InputError(f"'trajectory' must be one of {', '.join(KINDS)}")
+    if not isinstance(parameters, dict):
+        raise InputError("'parameters' must be an object of names and values")
+    return trajectory(name, **parameters)

@@ -1,0 +1,381 @@
+"""One flight as the control thread sees it: phases, references, and every reason to stop.
+
+idle -> takeoff -> mission -> landing -> idle \\________|_________/ silent
+
+`tick` is called with each odometry message and answers with what to send, or with nothing. Nothing is the
+safe answer: an autopilot in Offboard that hears no setpoint for COM_OF_LOSS_T takes over by itself. *The
+pilot wins*: any mode but Offboard silences the flight at once, and it never goes back by itself.
+
+Positions here are in the *home frame*: axes of the world (ENU), origin on the ground below the vehicle at
+arming, so that z is height above ground.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from companion.control import IDLE_STEP, ControlLaw, ControlStep, State
+from companion.guard import Guard
+from companion.vehicle_link import Latest, Odometry
+from models.errors import InputError
+from models.reference import Trajectory, transfer
+from models.trajectory import ReferenceSample, Waypoint
+
+Vector = tuple[float, float, float]
+
+IDLE, TAKEOFF, MISSION, LANDING, SILENT = "idle", "takeoff", "mission", "landing", "silent"
+CONTROLLERS = ("lqr", "corrected")
+_SETTLED_DISTANCE, _SETTLED_SPEED = 0.15, 0.25
+_LAND_FROM = 0.4  # m above ground at which the autopilot's own Land mode takes the last bit
+
+
+@dataclass(frozen=True)
+class Safety:
+    """Where a flight may go and when it must end.
+
+    The fence is a cylinder around home: `fence_radius`, `fence_height` in m. `takeoff_voltage` and
+    `land_voltage` are shares of the nominal voltage; the latter ends a flight when it lasts
+    `battery_patience` s. `odometry_gap` s of the vehicle's clock without odometry end a flight, as do a jump
+    of the position by `jump` m between two messages and a distance of `lost` m from the reference.
+    `climb_speed` and `transfer_speed` in m/s.
+    """
+
+    fence_radius: float = 10.0
+    fence_height: float = 8.0
+    takeoff_voltage: float = 0.90
+    land_voltage: float = 0.80
+    battery_patience: float = 2.0
+    odometry_gap: float = 0.25
+    jump: float = 1.0
+    lost: float = 4.0
+    climb_speed: float = 0.8
+    transfer_speed: float = 1.5
+
+    def check_trajectory(self, trajectory: Trajectory) -> str:
+        """'' where the whole reference lies inside the fence and above ground, otherwise the reason."""
+        (x0, y0, z0), (x1, y1, z1) = trajectory.bounds
+        radius = max(math.hypot(x, y) for x in (x0, x1) for y in (y0, y1))
+        if z0 < 0.05:
+            return f"it goes down to {z0:.2f} m above ground; keep it above 0.05 m"
+        if z1 > self.fence_height:
+            return f"it climbs to {z1:.1f} m, the fence ends at {self.fence_height:g} m"
+        if radius > self.fence_radius:
+            return f"it may go {radius:.1f} m from home, the fence ends at {self.fence_radius:g} m"
+        return ""
+
+
+@dataclass(frozen=True)
+class Mission:
+    """What to fly: a trajectory (home frame), how often, with which controller, guarded by what."""
+
+    identity: str
+    trajectory: Trajectory
+    controller: str = "lqr"
+    repeat: int = 1
+    guard: Guard | None = None
+    model: str = ""
+
+    def __post_init__(self) -> None:
+        if self.controller not in CONTROLLERS:
+            raise InputError(
+                f"controller '{self.controller}' is unknown; use one of {', '.join(CONTROLLERS)}"
+            )
+        if (self.guard is None) != (self.controller == "lqr"):
+            raise InputError("controller 'corrected' needs a deployed model")
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A stretch of a flight: fly `trajectory`, then wait up to `settle` s until the vehicle is there."""
+
+    phase: str
+    trajectory: Trajectory
+    settle: float = 0.0
+    name: str = ""
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What one tick decided: `step` and `reference` are None where nothing is sent."""
+
+    phase: str
+    interval: float
+    position: Vector
+    step: ControlStep | None = None
+    reference: ReferenceSample | None = None
+    guard: str = "off"
+    inference: float = 0.0
+    controller: str = ""
+    model: str = ""
+    trajectory: str = ""
+
+
+@dataclass
+class Flight:
+    """The state machine of a flight; `tick` belongs to the control thread, the rest may be called from any.
+
+    `on_event(level, kind, text)` must only enqueue. Orders from other threads wait for the next tick.
+    `wants_land` is what the flight asks of whoever may block: the autopilot's Land mode.
+    """
+
+    law: ControlLaw
+    safety: Safety
+    on_event: Callable[[str, str, str], None] = lambda level, kind, text: None
+    phase: str = IDLE
+    wants_land: bool = False
+    sent: int = 0
+    home: Vector = (0.0, 0.0, 0.0)
+    mission: Mission | None = None
+    outcome: str = ""
+    _orders: deque[Callable[[], None]] = field(default_factory=deque)
+    _legs: deque[Leg] = field(default_factory=deque)
+    _leg: Leg | None = None
+    _leg_begin: float = 0.0
+    _now: float = 0.0
+    _previous: Odometry | None = None
+    _low_since: float = math.inf
+    _yaw: float = 0.0
+    _sending: bool = False
+    _here: Waypoint = (0.0, 0.0, 0.0, 0.0)
+
+    # Orders
+
+    def prepare(self, mission: Mission) -> None:
+        """Begin to stream idle setpoints (no thrust, no rates), which Offboard and arming need to hear first."""
+
+        def order() -> None:
+            if self.phase == IDLE:
+                self.mission, self.phase, self.outcome = mission, TAKEOFF, ""
+                self._legs.clear()
+                self._leg, self.wants_land = None, False
+                self._low_since = math.inf
+
+        self._orders.append(order)
+
+    def cancel(self, reason: str) -> None:
+        """Stop streaming before the vehicle has been armed."""
+
+        def order() -> None:
+            if self._leg is None and self.phase == TAKEOFF:
+                self._finish(reason)
+
+        self._orders.append(order)
+
+    def take_off(self) -> None:
+        """Armed and in Offboard: home is here, climb."""
+
+        def order() -> None:
+            if self.phase == TAKEOFF and self._leg is None and self.mission is not None:
+                assert self._previous is not None
+                self.home = self._previous.position
+                self._here = (0.0, 0.0, 0.0, self._yaw)
+                self._legs.extend(self._plan(self.mission))
+                self._next_leg()
+                self.on_event("info", "takeoff", f"taking off for {self.mission.trajectory.name}")
+
+        self._orders.append(order)
+
+    def land(self, reason: str, return_home: bool) -> None:
+        """End the flight: over home, or where it is now."""
+        self._orders.append(lambda: self._land(reason, return_home))
+
+    def give_up(self, reason: str) -> None:
+        """Fall silent, so that the autopilot's own failsafe ends the flight."""
+        self._orders.append(lambda: self._silence("gave_up", reason))
+
+    def abandon(self, reason: str) -> None:
+        """Forget a flight whose vehicle is gone: no odometry will come to end it."""
+        self.on_event("error", "abandoned", reason)
+        self._finish(reason)
+
+    @property
+    def home_set(self) -> bool:
+        """Whether `take_off` has taken effect."""
+        return self._leg is not None or self.phase == IDLE
+
+    @property
+    def sending(self) -> bool:
+        """Whether the last tick answered with a setpoint."""
+        return self._sending
+
+    # The control thread
+
+    def tick(self, odometry: Odometry, latest: Latest) -> Outcome:
+        """Decide what to send for this odometry message."""
+        out = self._decide(odometry, latest)
+        self._sending = out.step is not None
+        self.sent += self._sending
+        return out
+
+    def _decide(self, odometry: Odometry, latest: Latest) -> Outcome:
+        previous, self._previous = self._previous, odometry
+        interval = 0.0
+        if previous is not None:
+            interval = 1e-6 * (odometry.vehicle_time_us - previous.vehicle_time_us)
+        self._now = 1e-6 * odometry.vehicle_time_us
+        w, x, y, z = odometry.quaternion
+        self._yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        hx, hy, hz = self.home
+        px, py, pz = odometry.position
+        position = (px - hx, py - hy, pz - hz)
+        while self._orders:
+            self._orders.popleft()()
+            hx, hy, hz = self.home
+            position = (px - hx, py - hy, pz - hz)
+        out = Outcome(self.phase, interval, position)
+        if self.phase == IDLE:
+            return out
+        self._watch_mode(latest)
+        if self._leg is not None and self.phase != SILENT:
+            self._watch(odometry, previous, interval, position, latest)
+        out.phase = self.phase
+        mission = self.mission
+        if mission is None or self.phase in (IDLE, SILENT):
+            return out
+        out.controller, out.model, out.trajectory = mission.controller, mission.model, mission.trajectory.name
+        if self._leg is None:
+            out.step = IDLE_STEP
+            return out
+        if latest.flight_mode != "OFFBOARD":
+            return out  # landing by the autopilot's own mode
+        out.reference = reference = self._reference(position, odometry)
+        out.phase = self.phase
+        state = State(position, odometry.velocity, odometry.quaternion, position[2], latest.battery_voltage)
+        guard = mission.guard
+        out.step = self.law.step(state, reference, interval, guard)
+        if guard is not None:
+            out.guard, out.inference = guard.status, guard.inference_time
+        return out
+
+    def _plan(self, mission: Mission) -> list[Leg]:
+        trajectory, safety = mission.trajectory, self.safety
+        start, end = trajectory.start, trajectory.end
+        above = (0.0, 0.0, max(start[2], 0.6), self._yaw)
+        legs = [
+            Leg(TAKEOFF, transfer(self._here, above, safety.climb_speed, 1.5), name="climb"),
+            Leg(TAKEOFF, transfer(above, start, safety.transfer_speed, 2.0), 4.0, "to the start"),
+        ]
+        for i in range(mission.repeat):
+            if i and math.dist(end[:3], start[:3]) + abs(end[3] - start[3]) > 1e-6:
+                legs.append(
+                    Leg(TAKEOFF, transfer(end, start, safety.transfer_speed, 2.0), 2.0, "to the start")
+                )
+            legs.append(Leg(MISSION, trajectory, name=trajectory.name))
+        return legs + self._way_home(end)
+
+    def _way_home(self, begin: Waypoint) -> list[Leg]:
+        above = (0.0, 0.0, max(begin[2], 0.6), begin[3])
+        low = (0.0, 0.0, _LAND_FROM, begin[3])
+        return [
+            Leg(LANDING, transfer(begin, above, self.safety.transfer_speed, 2.0), name="home"),
+            Leg(LANDING, transfer(above, low, self.safety.climb_speed, 1.5), 1.0, "descent"),
+        ]
+
+    def _reference(self, position: Vector, odometry: Odometry) -> ReferenceSample:
+        leg = self._leg
+        assert leg is not None
+        t = self._now - self._leg_begin
+        late = t - leg.trajectory.duration
+        if late >= 0.0 and not self.wants_land:
+            end = leg.trajectory.end
+            there = math.dist(position, end[:3]) < _SETTLED_DISTANCE
+            still = math.hypot(*odometry.velocity) < _SETTLED_SPEED
+            if late >= leg.settle or (there and still):
+                self._next_leg()
+                assert self._leg is not None
+                leg, t = self._leg, self._now - self._leg_begin
+        reference = leg.trajectory.at(t)
+        self._here = (*reference.position, reference.yaw)
+        return reference
+
+    def _next_leg(self) -> None:
+        if not self._legs:
+            self.wants_land = True  # keep the last reference until the autopilot has taken over
+            return
+        before = self.phase
+        self._leg, self._leg_begin = self._legs.popleft(), self._now
+        self.phase = self._leg.phase
+        guard = self.mission.guard if self.mission is not None else None
+        if self.phase == MISSION and before != MISSION:
+            name = self._leg.name
+            self.on_event("info", "mission_started", f"flying {name}, {self._leg.trajectory.duration:.1f} s")
+            if guard is not None:
+                guard.start()
+        elif self.phase == LANDING and before == MISSION:
+            self.outcome = self.outcome or "finished"
+            self.on_event("info", "mission_flown", "trajectory flown, landing")
+            if guard is not None:
+                guard.stop()
+
+    def _watch_mode(self, latest: Latest) -> None:
+        """The pilot wins, and a vehicle that is not armed flies no more."""
+        if self._leg is None:  # streaming, not yet armed by us: `take_off` follows only on armed and Offboard
+            return
+        if not latest.armed:
+            if self.phase != LANDING and not self.outcome:
+                self.outcome = "the vehicle was disarmed in flight"
+                self.on_event("error", "disarmed", self.outcome)
+            self._finish(self.outcome or "finished")
+        elif latest.flight_mode != "OFFBOARD" and self.phase != SILENT:
+            if self.wants_land and latest.flight_mode == "LAND":
+                return
+            self._silence(
+                "pilot_takeover", f"{latest.flight_mode} was chosen by the pilot or the autopilot: silent"
+            )
+
+    def _watch(
+        self, odometry: Odometry, previous: Odometry | None, interval: float, position: Vector, latest: Latest
+    ) -> None:
+        safety = self.safety
+        if self.wants_land or latest.flight_mode != "OFFBOARD":
+            return
+        if interval > safety.odometry_gap or interval < 0.0:
+            what = f"missing for {interval:.2f} s" if interval > 0.0 else "going back in time"
+            self._land(f"odometry was {what}", return_home=False, kind="odometry_gap")
+            return
+        if previous is not None and math.dist(odometry.position, previous.position) > safety.jump:
+            self._land("the estimated position jumped", return_home=False, kind="position_jump")
+            return
+        if math.hypot(position[0], position[1]) > safety.fence_radius or position[2] > safety.fence_height:
+            self._land("outside the geofence", return_home=False, kind="geofence")
+            return
+        if math.dist(position, self._here[:3]) > safety.lost:
+            self._land(f"more than {safety.lost:g} m from the reference", return_home=False, kind="lost")
+            return
+        low = 0.0 < latest.battery_voltage < safety.land_voltage * self.law.vehicle.nominal_voltage
+        self._low_since = min(self._low_since, self._now) if low else math.inf
+        if self._now - self._low_since > safety.battery_patience and self.phase != LANDING:
+            self._land(f"battery at {latest.battery_voltage:.1f} V", return_home=True, kind="battery_low")
+
+    def _land(self, reason: str, return_home: bool, kind: str = "landing") -> None:
+        if self.phase not in (TAKEOFF, MISSION, LANDING):
+            return
+        if self._leg is None:
+            self._finish(reason)
+            return
+        self.outcome = self.outcome or reason
+        self.on_event("warning", kind, f"{reason}: landing {'at home' if return_home else 'here'}")
+        if self.mission is not None and self.mission.guard is not None:
+            self.mission.guard.stop()
+        self._legs.clear()
+        if return_home:
+            self._legs.extend(self._way_home(self._here))
+            self._next_leg()
+        else:
+            stay = self._here
+            self._leg, self._leg_begin = Leg(LANDING, transfer(stay, stay, 1.0, 1.0), name="stay"), self._now
+            self.phase, self.wants_land = LANDING, True
+
+    def _silence(self, kind: str, text: str) -> None:
+        self.phase, self.wants_land = SILENT, False
+        self.outcome = self.outcome or text
+        self._legs.clear()
+        self.on_event("warning", kind, text)
+
+    def _finish(self, outcome: str) -> None:
+        self.phase, self.outcome, self.wants_land = IDLE, outcome, False
+        self._leg = None
+        self._legs.clear()

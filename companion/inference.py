@@ -1,0 +1,253 @@
+"""Deployed models: an ONNX file from the ground is checked against the contract before anything flies with
+it."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+from companion.guard import Range
+from models import contract
+from models.vehicle import Vehicle
+
+MAX_BYTES = 4 << 20
+"""The networks meant here have tens of kilobytes; anything near this is not one of them."""
+TIMING_RUNS = 200
+_RANGE_SAMPLES = 64
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """What the metadata of an accepted model say; `features` are the training ranges in the model's order."""
+
+    hash: str
+    name: str
+    version: str
+    features: tuple[Range, ...]
+    chain: tuple[dict[str, Any], ...] = field(default=(), compare=False)
+    data_hash: str = ""
+
+    @property
+    def wants_yaw(self) -> bool:
+        """Whether the features end with cos psi, sin psi."""
+        return len(self.features) > len(contract.FEATURES)
+
+
+class Model:
+    """An accepted model: call it with the features (list of F floats) for three accelerations (m/s², heading
+    frame).
+
+    One ONNX Runtime thread, input and output bound to buffers once; not to be called from two threads at a
+    time.
+    """
+
+    def __init__(self, session: onnxruntime.InferenceSession, info: ModelInfo) -> None:
+        self.info = info
+        self._session = session
+        self._input = np.zeros((1, len(info.features)), dtype=np.float32)
+        self._output = np.zeros((1, 3), dtype=np.float32)
+        self._binding = session.io_binding()
+        self._binding.bind_input(
+            contract.INPUT_NAME, "cpu", 0, np.float32, self._input.shape, self._input.ctypes.data
+        )
+        self._binding.bind_output(
+            contract.OUTPUT_NAME, "cpu", 0, np.float32, self._output.shape, self._output.ctypes.data
+        )
+
+    def __call__(self, features: Sequence[float]) -> list[float]:
+        """Error acceleration in m/s², heading frame."""
+        self._input[0] = features
+        self._session.run_with_iobinding(self._binding)
+        return self._output[0].tolist()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a model was accepted; `reason` is one line, `seconds` the median and the worst time of one
+    inference."""
+
+    accepted: bool
+    reason: str
+    model: Model | None = None
+    median: float = math.nan
+    worst: float = math.nan
+
+
+class _Refused(Exception):
+    """Carries the reason out of the checks."""
+
+
+def check_model(onnx: bytes, vehicle: Vehicle, deadline: float = 0.002) -> Verdict:
+    """Check an ONNX file against `models.contract` and the vehicle; never raises, whatever the bytes.
+
+    `deadline` in s is what one inference may take: the median of many runs must stay below half of it.
+    """
+    try:
+        return _check(onnx, vehicle, deadline)
+    except _Refused as refusal:
+        return Verdict(False, str(refusal))
+
+
+def _check(onnx: bytes, vehicle: Vehicle, deadline: float) -> Verdict:
+    if len(onnx) > MAX_BYTES:
+        raise _Refused(f"the file has {len(onnx)} bytes; at most {MAX_BYTES} are accepted")
+    session = _open(onnx)
+    meta = dict(session.get_modelmeta().custom_metadata_map)
+    for key in contract.REQUIRED_KEYS:
+        if key not in meta:
+            raise _Refused(f"its metadata lack '{key}'; export it with `groundstation deploy`")
+    if meta[contract.KEY_CONTRACT] != contract.CONTRACT_VERSION:
+        raise _Refused(
+            f"it follows contract {meta[contract.KEY_CONTRACT]!r}; this companion knows "
+            f"{contract.CONTRACT_VERSION!r}"
+        )
+    _check_vehicle(_json(meta, contract.KEY_VEHICLE, dict), vehicle)
+    ranges = _ranges(_json(meta, contract.KEY_FEATURES, list))
+    _check_ports(session, len(ranges))
+    chain = _json(meta, contract.KEY_CHAIN, list)
+    info = ModelInfo(
+        contract.model_hash(onnx),
+        meta[contract.KEY_NAME],
+        meta[contract.KEY_VERSION],
+        ranges,
+        tuple(chain),
+        meta[contract.KEY_DATA_HASH],
+    )
+    model = Model(session, info)
+    _check_golden(model, meta)
+    _check_range(model)
+    median, worst = _time(model)
+    if not median <= 0.5 * deadline:
+        raise _Refused(
+            f"one inference takes {1e3 * median:.2f} ms; at most {500 * deadline:.2f} ms are accepted"
+        )
+    text = f"{info.name} {info.version}, {1e6 * median:.0f} us an inference"
+    return Verdict(True, text, model, median, worst)
+
+
+def _open(onnx: bytes) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.log_severity_level = 4
+    # The arena keeps what it once took; these networks need a few kilobytes.
+    options.enable_cpu_mem_arena = False
+    try:
+        return onnxruntime.InferenceSession(onnx, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # noqa: BLE001 - ONNX Runtime raises many kinds for bytes that are no model
+        first = " ".join(str(error).split())[:160]
+        raise _Refused(f"not an ONNX model that can be run here ({first})") from None
+
+
+def _json(meta: dict[str, str], key: str, kind: type) -> Any:
+    try:
+        value = json.loads(meta[key])
+    except json.JSONDecodeError:
+        value = None
+    if not isinstance(value, kind):
+        raise _Refused(f"its metadata '{key}' is not a JSON {'object' if kind is dict else 'list'}")
+    return value
+
+
+def _check_vehicle(stated: dict[str, Any], vehicle: Vehicle) -> None:
+    name = stated.get("name")
+    if name != vehicle.name:
+        raise _Refused(f"made for vehicle '{name}', this one is '{vehicle.name}'")
+    for key, ours in (("mass", vehicle.mass), ("hover_thrust", vehicle.hover_thrust)):
+        value = stated.get(key)
+        if type(value) not in (int, float) or not abs(float(value) - ours) <= 0.01 * ours:  # type: ignore[arg-type]
+            raise _Refused(f"made for {key} {value}, this vehicle has {ours:g}; refit it")
+
+
+def _ranges(entries: list[Any]) -> tuple[Range, ...]:
+    ranges = []
+    for entry in entries:
+        try:
+            one = Range(str(entry["name"]), str(entry["unit"]), float(entry["low"]), float(entry["high"]))
+        except (KeyError, TypeError, ValueError):
+            raise _Refused("its metadata 'features' need name, unit, low and high in each entry") from None
+        if not (math.isfinite(one.low) and math.isfinite(one.high) and one.low <= one.high):
+            raise _Refused(f"the training range of feature '{one.name}' is {one.low} to {one.high}")
+        ranges.append(one)
+    given = {one.name: one.unit for one in ranges}
+    base = list(contract.FEATURES.items())
+    if list(given.items()) not in (base, base + list(contract.YAW_FEATURES.items())):
+        raise _Refused(
+            f"its features are {', '.join(given) or 'none'}; expected {', '.join(contract.FEATURES)} "
+            f"with their units, and optionally {', '.join(contract.YAW_FEATURES)}"
+        )
+    return tuple(ranges)
+
+
+def _check_ports(session: onnxruntime.InferenceSession, features: int) -> None:
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    for ports, name, width in ((inputs, contract.INPUT_NAME, features), (outputs, contract.OUTPUT_NAME, 3)):
+        if [port.name for port in ports] != [name]:
+            raise _Refused(f"its ports are {[port.name for port in ports]}; expected one called '{name}'")
+        shape = ports[0].shape
+        free = len(shape) == 2 and (shape[0] is None or isinstance(shape[0], str) or shape[0] == 1)
+        if ports[0].type != "tensor(float)" or not free or shape[1] not in (width, None):
+            raise _Refused(f"'{name}' is {ports[0].type} {shape}; expected tensor(float) [N, {width}]")
+
+
+def _run(model: Model, features: Sequence[float]) -> list[float]:
+    try:
+        return model(features)
+    except Exception as error:  # noqa: BLE001 - a graph may fail in as many ways as it has operators
+        first = " ".join(str(error).split())[:160]
+        raise _Refused(f"it cannot be evaluated ({first})") from None
+
+
+def _check_golden(model: Model, meta: dict[str, str]) -> None:
+    width = len(model.info.features)
+    golden = []
+    for key, columns in ((contract.KEY_GOLDEN_FEATURES, width), (contract.KEY_GOLDEN_DELTA, 3)):
+        try:
+            values = np.array(_json(meta, key, list), dtype=float)
+        except (TypeError, ValueError):
+            values = np.empty(0)
+        if (
+            values.ndim != 2
+            or values.shape[1] != columns
+            or len(values) < 3
+            or not np.all(np.isfinite(values))
+        ):
+            raise _Refused(f"its metadata '{key}' must hold at least 3 rows of {columns} finite numbers")
+        golden.append(values)
+    if len(golden[0]) != len(golden[1]):
+        raise _Refused(f"it has {len(golden[0])} golden inputs and {len(golden[1])} golden outputs")
+    for features, expected in zip(*golden, strict=True):
+        error = float(np.max(np.abs(np.array(_run(model, features.tolist())) - expected)))
+        if not error <= contract.GOLDEN_TOLERANCE:
+            raise _Refused(
+                f"a golden vector differs by {error:.2g} m/s^2 (at most {contract.GOLDEN_TOLERANCE:g}): "
+                "the file is damaged or this runtime computes something else"
+            )
+
+
+def _check_range(model: Model) -> None:
+    """Finite at random points of the training range and at its corners."""
+    low = np.array([one.low for one in model.info.features])
+    high = np.array([one.high for one in model.info.features])
+    points = np.random.default_rng(0).uniform(size=(_RANGE_SAMPLES, len(low)))
+    points[0], points[1] = 0.0, 1.0
+    for point in low + points * (high - low):
+        if not np.all(np.isfinite(_run(model, point.tolist()))):
+            raise _Refused("it returns numbers that are not finite inside its own training range")
+
+
+def _time(model: Model) -> tuple[float, float]:
+    middle = [0.5 * (one.low + one.high) for one in model.info.features]
+    seconds = []
+    for _ in range(TIMING_RUNS):
+        begin = time.perf_counter()
+        model(middle)
+        seconds.append(time.perf_counter() - begin)
+    return float(np.median(seconds)), max(seconds)

@@ -1,0 +1,129 @@
+"""The companion's settings: a commented TOML file, overridden by flags."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from companion.control import Limits
+from companion.flight import Safety
+from companion.guard import GuardLimits
+from companion.zenoh_session import ZenohSettings
+from models.errors import InputError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything `companion run` needs; the sections are the settings of the parts.
+
+    `design` empty means `design.json` beside the vehicle file. `rate` in Hz, `timeout` in s to wait for an
+    autopilot.
+    """
+
+    vehicle: str = ""
+    design: str = ""
+    connect: str = "udpin://127.0.0.1:14540"
+    timeout: float = 10.0
+    rate: float = 100.0
+    records: str = "records"
+    models: str = "deployed"
+    zenoh: ZenohSettings = field(default_factory=ZenohSettings)
+    safety: Safety = field(default_factory=Safety)
+    limits: Limits = field(default_factory=Limits)
+    guard: GuardLimits = field(default_factory=GuardLimits)
+
+    def checked(self) -> Settings:
+        """The same, or `InputError` for a value without sense."""
+        if not 10.0 <= self.rate <= 1000.0:
+            raise InputError(f"rate = {self.rate:g} is outside 10 to 1000 Hz")
+        if not 0.1 <= self.timeout <= 600.0:
+            raise InputError(f"timeout = {self.timeout:g} is outside 0.1 to 600 s")
+        if not self.vehicle:
+            raise InputError("no vehicle file; pass --vehicle FILE or set 'vehicle' in the configuration")
+        return self
+
+    @property
+    def design_path(self) -> Path:
+        """The design file."""
+        return Path(self.design) if self.design else Path(self.vehicle).with_name("design.json")
+
+
+def load_settings(path: str | Path | None) -> Settings:
+    """Read `companion.toml`; the defaults without a file. File names in it are relative to it.
+
+    Raises `InputError` for a file that cannot be read and for every key or value that does not fit, with a
+    suggestion.
+    """
+    if path is None:
+        return Settings()
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the configuration ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}; correct that line") from None
+    settings = _filled(Settings(), table, str(path), "")
+    changes: dict[str, Any] = {
+        name: str(path.parent / getattr(settings, name))
+        for name in ("vehicle", "design", "records", "models")
+        if name in table and getattr(settings, name)
+    }
+    settings = replace(settings, **changes)
+    if "config" in table.get("zenoh", {}):
+        file = replace(settings.zenoh, config=str(path.parent / settings.zenoh.config))
+        settings = replace(settings, zenoh=file)
+    return settings
+
+
+def _filled(default: T, table: dict[str, Any], where: str, section: str) -> T:
+    known = {f.name: getattr(default, f.name) for f in fields(default)}  # type: ignore[arg-type]
+    changes: dict[str, Any] = {}
+    for key, value in table.items():
+        name = f"{section}.{key}" if section else key
+        if key not in known:
+            close = difflib.get_close_matches(key, list(known), 1)
+            hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
+            raise InputError(f"{where}: unknown key '{name}'; {hint}")
+        changes[key] = _value(known[key], value, f"{where}: '{name}'")
+    return replace(default, **changes)  # type: ignore[type-var]
+
+
+def _value(default: Any, value: Any, where: str) -> Any:
+    """`value` where it fits the type of `default`, otherwise `InputError`."""
+    if hasattr(default, "__dataclass_fields__"):
+        if not isinstance(value, dict):
+            raise InputError(f"{where} must be a section, not {value!r}")
+        file, _, section = where.partition(": ")
+        return _filled(default, value, file, section.strip("'"))
+    if isinstance(default, str):
+        if not isinstance(value, str):
+            raise InputError(f"{where} must be a text, not {value!r}")
+        return value
+    if isinstance(default, tuple):
+        if not isinstance(value, list):
+            raise InputError(f"{where} must be a list, not {value!r}")
+        if default and isinstance(default[0], float):
+            if len(value) != len(default):
+                raise InputError(f"{where} must have {len(default)} numbers, not {len(value)}")
+            return tuple(_number(one, where) for one in value)
+        return tuple(_value("", one, where) for one in value)
+    number = _number(value, where)
+    return int(number) if isinstance(default, int) else number
+
+
+def _number(value: Any, where: str) -> float:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float))
+        or not math.isfinite(value)
+        or value <= 0
+    ):
+        raise InputError(f"{where} must be a positive number, not {value!r}")
+    return float(value)

@@ -1,0 +1,200 @@
+"""The companion on Zenoh: ticks and events out, missions, models and records on request.
+
+Keys are `models.contract.key(vehicle, leaf)`:
+
+* `tick`: serialised `Tick`, every control tick; dropped rather than waited for, the last ones kept for late
+joiners. * `event`: serialised `Event`; reliable, the last ones kept. * `status`: a liveliness token, and a
+query answered with JSON. * `mission`: query with JSON `{"trajectory", "parameters", "controller", "repeat"}`
+or `{"setpoints": CSV, ...}` or `{"command": "abort" | "land"}`. * `model`: query with the bytes of an ONNX
+file, or JSON `{"command": "list" | "rollback"}`. * `record`: query with JSON `{}` for the list, or `{"name",
+"offset", "length"}` for a piece of one record: its bytes as `application/octet-stream`, with JSON `{"size",
+"offset"}` attached; ask on until `offset` reaches `size`.
+
+Every other answer is JSON with `accepted` and `reason`. Zenoh's callbacks only enqueue. The control thread
+never calls Zenoh: it hands serialised ticks to a publishing thread through a bounded queue and goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from models import contract
+from models.record_pb2 import Event
+
+TICKS_KEPT, EVENTS_KEPT = 1000, 200
+REQUESTS_WAITING = 64
+PIECE = 1 << 20
+"""Greatest number of bytes of a record in one answer."""
+
+_JSON, _BYTES, _PROTOBUF = "application/json", "application/octet-stream", "application/protobuf"
+
+
+class Telemetry:
+    """Publishes and answers for one vehicle; all handlers run on one service thread.
+
+    `handlers` maps the leaves `status`, `mission` and `model` to functions of the request's payload that
+    return the answer. `records` is the folder that `record` serves from.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        vehicle: str,
+        handlers: dict[str, Callable[[bytes], dict[str, Any]]],
+        records: Path,
+    ) -> None:
+        self.ticks_dropped = 0
+        self._session, self._records = session, records
+        self._handlers = {"record": self._record, **handlers}
+        self._requests: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(REQUESTS_WAITING)
+        self._ticks: deque[bytes] = deque()
+        self._events: deque[bytes] = deque()
+        self._wake = threading.Event()
+        self._closing = False
+        self._tick_publisher = zenoh.ext.declare_advanced_publisher(
+            session,
+            contract.key(vehicle, "tick"),
+            encoding=_PROTOBUF,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_LOW,
+            cache=zenoh.ext.CacheConfig(max_samples=TICKS_KEPT),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+            publisher_detection=True,
+        )
+        self._event_publisher = zenoh.ext.declare_advanced_publisher(
+            session,
+            contract.key(vehicle, "event"),
+            encoding=_PROTOBUF,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            cache=zenoh.ext.CacheConfig(max_samples=EVENTS_KEPT),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+            publisher_detection=True,
+        )
+        self._queryables = [
+            session.declare_queryable(contract.key(vehicle, leaf), self._enqueuer(leaf), complete=True)
+            for leaf in self._handlers
+        ]
+        self._token = session.liveliness().declare_token(contract.key(vehicle, "status"))
+        self._threads = [
+            threading.Thread(target=self._publish, name="zenoh-publisher", daemon=True),
+            threading.Thread(target=self._serve, name="zenoh-service", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def tick(self, data: bytes) -> None:
+        """Hand over a serialised tick; the control thread's only touch with this class."""
+        if len(self._ticks) < TICKS_KEPT:
+            self._ticks.append(data)
+        else:
+            self.ticks_dropped += 1
+        self._wake.set()
+
+    def event(self, event: Event) -> None:
+        """Hand over an event; any thread."""
+        self._events.append(event.SerializeToString())
+        self._wake.set()
+
+    def close(self) -> None:
+        """Publish what waits, say good-bye and close the session."""
+        self._closing = True
+        self._wake.set()
+        with contextlib.suppress(queue.Full):
+            self._requests.put(None, timeout=1.0)
+        for thread in self._threads:
+            thread.join(2.0)
+        self._token.undeclare()
+        for queryable in self._queryables:
+            queryable.undeclare()
+        self._session.close()
+
+    def _publish(self) -> None:
+        while True:
+            self._wake.wait()
+            self._wake.clear()
+            while self._events:
+                self._event_publisher.put(self._events.popleft())
+            while self._ticks:
+                self._tick_publisher.put(self._ticks.popleft())
+            if self._closing:
+                return
+
+    def _enqueuer(self, leaf: str) -> Callable[[zenoh.Query], None]:
+        def enqueue(query: zenoh.Query) -> None:
+            try:
+                self._requests.put_nowait((leaf, query))
+            except queue.Full:
+                _answer(query, {"accepted": False, "reason": "too many requests are waiting; ask again"})
+                query.drop()
+
+        return enqueue
+
+    def _serve(self) -> None:
+        while (item := self._requests.get()) is not None:
+            leaf, query = item
+            with query:
+                payload = query.payload.to_bytes() if query.payload is not None else b""
+                try:
+                    answer = self._handlers[leaf](payload)
+                except Exception as error:  # noqa: BLE001 - one bad request must not end the service
+                    answer = {"accepted": False, "reason": f"internal error: {type(error).__name__}: {error}"}
+                _answer(query, answer)
+
+    def _record(self, payload: bytes) -> dict[str, Any]:
+        request = read_json(payload)
+        if "name" not in request:
+            return {"accepted": True, "reason": "", "records": list_records(self._records)}
+        name, offset, length = str(request["name"]), request.get("offset", 0), request.get("length", PIECE)
+        path = self._records / name
+        if Path(name).name != name or not path.is_file():
+            return {"accepted": False, "reason": f"no record '{name}'; ask for the list"}
+        if type(offset) is not int or type(length) is not int or offset < 0 or length < 1:
+            return {"accepted": False, "reason": "'offset' and 'length' must be whole numbers"}
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            file.seek(min(offset, size))
+            return {"bytes": file.read(min(length, PIECE)), "size": size, "offset": offset}
+
+
+def read_json(payload: bytes) -> dict[str, Any]:
+    """The JSON object of a request; `{}` for none. Raises `ValueError` for anything else."""
+    value = json.loads(payload) if payload else {}
+    if not isinstance(value, dict):
+        raise ValueError("the request must be a JSON object")
+    return value
+
+
+def list_records(folder: Path) -> list[dict[str, Any]]:
+    """Records on board, oldest first: name, size in bytes, time of the last write (s since 1970)."""
+    found = []
+    for path in sorted(folder.glob("*.mcap")):
+        stat = path.stat()
+        found.append({"name": path.name, "size": stat.st_size, "time": round(stat.st_mtime, 3)})
+    return found
+
+
+def make_event(level: str, kind: str, text: str, vehicle_time_us: int = 0) -> Event:
+    """An event of now; `level` is info, warning or error."""
+    return Event(
+        vehicle_time_us=vehicle_time_us, host_time_ns=time.monotonic_ns(), level=level, kind=kind, text=text
+    )
+
+
+def _answer(query: zenoh.Query, answer: dict[str, Any]) -> None:
+    if "bytes" in answer:
+        attached = json.dumps({"size": answer["size"], "offset": answer["offset"]})
+        query.reply(query.key_expr, answer["bytes"], encoding=_BYTES, attachment=attached)
+    else:
+        query.reply(query.key_expr, json.dumps(answer), encoding=_JSON)

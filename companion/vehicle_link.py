@@ -1,0 +1,385 @@
+"""The wire to the autopilot: MAVSDK, with every message that matters read as it stands on the wire.
+
+`mavlink_direct` is used instead of MAVSDK's telemetry and offboard plugins, for two reasons. The odometry's
+child frame decides whether its velocity is in the body or in the world, and the plugin loses that field. The
+offboard plugin sends the last setpoint again at 20 Hz for ever; here a setpoint leaves only when the control
+law made one, so that a companion that hangs, is stopped or is killed falls silent and the autopilot's
+offboard-loss failsafe takes over.
+
+MAVLink speaks NED and FRD; this module turns them into ENU and FLU, and nothing else in the companion knows
+of them. Callbacks run on MAVSDK's thread; it is the control thread.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import mavsdk
+from mavsdk.mavsdk import Configuration, Mavsdk
+from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
+from mavsdk.plugins.param import Param
+
+from models.errors import InputError
+
+Vector = tuple[float, float, float]
+
+_ROOT_HALF = math.sqrt(0.5)
+_FRAMES_WORLD_NED = (1,)  # MAV_FRAME_LOCAL_NED: what PX4 says of its odometry's velocity
+_FRAMES_BODY_FRD = (8, 12)  # MAV_FRAME_BODY_NED (deprecated name) and MAV_FRAME_BODY_FRD
+
+_MESSAGE_IDS = {
+    "ODOMETRY": 331,
+    "HIGHRES_IMU": 105,
+    "BATTERY_STATUS": 147,
+    "ESC_STATUS": 291,
+    "EXTENDED_SYS_STATE": 245,
+    "CURRENT_MODE": 436,
+}
+_SET_MESSAGE_INTERVAL, _DO_SET_MODE, _ARM_DISARM = 511, 176, 400
+_ACCEPTED = 0
+_RESULTS = {
+    1: "temporarily rejected",
+    2: "denied",
+    3: "unsupported",
+    4: "failed",
+    5: "in progress",
+    6: "cancelled",
+}
+_ARMED = 128
+_MODES = {
+    (1, 0): "MANUAL",
+    (2, 0): "ALTCTL",
+    (3, 0): "POSCTL",
+    (4, 1): "READY",
+    (4, 2): "TAKEOFF",
+    (4, 3): "HOLD",
+    (4, 4): "MISSION",
+    (4, 5): "RETURN_TO_LAUNCH",
+    (4, 6): "LAND",
+    (4, 8): "FOLLOW_ME",
+    (5, 0): "ACRO",
+    (6, 0): "OFFBOARD",
+    (7, 0): "STABILIZED",
+    (8, 0): "RATTITUDE",
+}
+_MODE_NUMBERS = {"OFFBOARD": (6, 0), "LAND": (4, 6), "HOLD": (4, 3)}
+_LANDED = {0: "unknown", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
+_RPM = 2.0 * math.pi / 60.0
+_AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
+
+
+class Odometry(NamedTuple):
+    """One odometry message, ENU and FLU, SI; `vehicle_time_us` is the vehicle's clock, `host_time_ns`
+    ours."""
+
+    vehicle_time_us: int
+    host_time_ns: int
+    position: Vector
+    velocity: Vector
+    quaternion: tuple[float, float, float, float]
+    angular_velocity: Vector
+    reset_counter: int
+
+
+@dataclass
+class Latest:
+    """The last of everything that arrives beside the odometry; written by MAVSDK's thread, read by any.
+
+    `specific_force` m/s² FLU, `battery_voltage` V (0 unknown), `rotor_speed` rad/s (empty unknown).
+    """
+
+    specific_force: Vector | None = None
+    battery_voltage: float = 0.0
+    rotor_speed: tuple[float, ...] = ()
+    flight_mode: str = "UNKNOWN"
+    armed: bool = False
+    landed: str = "unknown"
+    heartbeat: float = -math.inf
+    texts: deque[str] = field(default_factory=lambda: deque(maxlen=20))
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What arrives: messages a second of the vehicle's clock (odometry), and of ours (the others).
+
+    `longest_gap` in s of the vehicle's clock between two odometry messages, `duration` of the measurement in
+    s.
+    """
+
+    odometry: float
+    imu: float
+    battery: float
+    esc: float
+    longest_gap: float
+    duration: float
+
+
+class VehicleLink:
+    """A connection to one autopilot.
+
+    Raises `InputError` where the address cannot be used or nobody answers within `timeout` s. `on_odometry`
+    is called with each odometry message on the control thread; what it raises ends up in `on_error` and sends
+    nothing.
+    """
+
+    def __init__(self, address: str = "udpin://127.0.0.1:14540", timeout: float = 10.0) -> None:
+        self.address = address
+        self.latest = Latest()
+        self.on_odometry: Callable[[Odometry], None] = lambda odometry: None
+        self.on_state: Callable[[], None] = lambda: None
+        self.on_error: Callable[[str], None] = lambda text: None
+        self.malformed = 0
+        self._counts = dict.fromkeys(("ODOMETRY", "HIGHRES_IMU", "BATTERY_STATUS", "ESC_STATUS"), 0)
+        self._times: deque[int] = deque(maxlen=4096)
+        self._escs: dict[int, float] = {}
+        self._param_lock = threading.Lock()
+        # MAVSDK prints what it does in colour on standard output, which belongs to our caller.
+        mavsdk.log_subscribe(lambda level, text, file, line: True)
+        # A ground station's heartbeat would turn STATUSTEXT on, but PX4 then counts us as its data link.
+        self._mavsdk = Mavsdk(
+            Configuration.create_with_component_type(mavsdk.ComponentType.COMPANION_COMPUTER)
+        )
+        result = self._mavsdk.add_any_connection(address)
+        if result != mavsdk.ConnectionResult.SUCCESS:
+            self._mavsdk.destroy()
+            reason = result.name.lower().replace("_", " ")
+            raise InputError(
+                f"cannot open {address} ({reason}): is another program using the port, or the address "
+                "misspelt?"
+            )
+        system = self._mavsdk.first_autopilot(timeout)
+        if system is None:
+            self._mavsdk.destroy()
+            raise InputError(
+                f"no autopilot answering on {address} within {timeout:g} s; start it, or pass its address "
+                "with --connect"
+            )
+        self._system = system.get_system_id()
+        self._param = Param(system)
+        self._direct = MavlinkDirect(system)
+        for name, handler in (
+            ("ODOMETRY", self._odometry),
+            ("HIGHRES_IMU", self._imu),
+            ("BATTERY_STATUS", self._battery),
+            ("ESC_STATUS", self._esc),
+            ("HEARTBEAT", self._heartbeat),
+            ("CURRENT_MODE", self._current_mode),
+            ("EXTENDED_SYS_STATE", self._landed),
+            ("STATUSTEXT", self._text),
+        ):
+            self._direct.subscribe_message(name, self._safe(handler))
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._direct.destroy()
+        self._mavsdk.destroy()
+
+    # What goes out
+
+    def send_rates(self, time_us: int, thrust: float, body_rate: Vector) -> None:
+        """One SET_ATTITUDE_TARGET: normalised collective and body rates (rad/s, FLU); attitude ignored.
+
+        Raises `MavlinkDirectError` where MAVSDK refuses it.
+        """
+        p, q, r = body_rate
+        self._direct.send_message(
+            MavlinkMessage(
+                "SET_ATTITUDE_TARGET",
+                target_system_id=self._system,
+                target_component_id=_AUTOPILOT,
+                fields_json=f'{{"time_boot_ms":{time_us // 1000 & 0xFFFFFFFF},"target_system":{self._system},'
+                f'"target_component":1,"type_mask":128,"q":[1,0,0,0],"body_roll_rate":{p:.7g},'
+                f'"body_pitch_rate":{-q:.7g},"body_yaw_rate":{-r:.7g},"thrust":{thrust:.7g},"thrust_body":[0,0,0]}}',
+            )
+        )
+
+    def set_mode(self, mode: str) -> str:
+        """Ask for a flight mode (OFFBOARD, LAND, HOLD); returns '' where accepted, otherwise the reason."""
+        main, sub = _MODE_NUMBERS[mode]
+        return self.command(_DO_SET_MODE, 1.0, float(main), float(sub))
+
+    def arm(self) -> str:
+        """Ask for arming; returns '' where accepted, otherwise the reason."""
+        return self.command(_ARM_DISARM, 1.0)
+
+    def disarm(self) -> str:
+        """Ask for disarming (refused in the air); returns '' where accepted, otherwise the reason."""
+        return self.command(_ARM_DISARM, 0.0)
+
+    def request_rates(self, rate: float) -> None:
+        """Ask for odometry at `rate` Hz, the accelerometer no slower, and the rest as often as they are
+        useful.
+
+        A wish only: `measure` tells what arrives.
+        """
+        wishes = {
+            "ODOMETRY": rate,
+            "HIGHRES_IMU": max(rate, 250.0) if rate < 250.0 else min(rate, 500.0),
+            "BATTERY_STATUS": 10.0,
+            "ESC_STATUS": min(rate, 100.0),
+            "EXTENDED_SYS_STATE": 5.0,
+            "CURRENT_MODE": 10.0,
+        }
+        for name, wish in wishes.items():
+            self.command(_SET_MESSAGE_INTERVAL, float(_MESSAGE_IDS[name]), 1e6 / wish)
+
+    def command(self, number: int, *parameters: float) -> str:
+        """A COMMAND_LONG; blocks until acknowledged. Returns '' where accepted, otherwise the reason."""
+        fields: dict[str, Any] = {f"param{i}": 0.0 for i in range(1, 8)}
+        fields.update({f"param{i}": value for i, value in enumerate(parameters, 1)})
+        fields.update(target_system=self._system, target_component=_AUTOPILOT, command=number, confirmation=0)
+        message = MavlinkMessage(
+            "COMMAND_LONG",
+            target_system_id=self._system,
+            target_component_id=_AUTOPILOT,
+            fields_json=json.dumps(fields),
+        )
+        try:
+            ack = json.loads(self._direct.send_command(message).fields_json)
+        except MavlinkDirectError as error:
+            return f"no answer ({error.result.name.lower()})"
+        result = int(ack["result"])
+        if result == _ACCEPTED:
+            return ""
+        told = f": {self.latest.texts[-1]}" if self.latest.texts else ""
+        return _RESULTS.get(result, f"result {result}") + told
+
+    def parameter(self, name: str) -> float | int | None:
+        """A parameter of the autopilot, whichever type it has; None where it has none of that name or is
+        silent.
+        """
+        with self._param_lock:
+            for get in (self._param.get_param_float, self._param.get_param_int):
+                try:
+                    return get(name)
+                except mavsdk.MavsdkError:
+                    continue
+        return None
+
+    # What comes in
+
+    def measure(self, duration: float = 1.0) -> Rates:
+        """Count what arrives for `duration` s."""
+        before = dict(self._counts)
+        self._times.clear()
+        begin = time.monotonic()
+        time.sleep(duration)
+        elapsed = time.monotonic() - begin
+        times = list(self._times)
+        count = {name: (self._counts[name] - before[name]) / elapsed for name in before}
+        gaps = [1e-6 * (b - a) for a, b in pairwise(times)]
+        span = 1e-6 * (times[-1] - times[0]) if len(times) > 1 else 0.0
+        return Rates(
+            odometry=(len(times) - 1) / span if span > 0.0 else 0.0,
+            imu=count["HIGHRES_IMU"],
+            battery=count["BATTERY_STATUS"],
+            esc=count["ESC_STATUS"],
+            longest_gap=max(gaps, default=math.inf),
+            duration=elapsed,
+        )
+
+    def _safe(self, handler: Callable[[dict[str, Any]], None]) -> Callable[[MavlinkMessage, Any], None]:
+        def callback(message: MavlinkMessage, _: Any) -> None:
+            arrived = time.monotonic_ns()
+            try:
+                fields = json.loads(message.fields_json)
+                fields["arrived"] = arrived
+                fields["component"] = message.component_id
+                handler(fields)
+            except (KeyError, TypeError, ValueError, IndexError) as error:
+                self.malformed += 1
+                self.on_error(f"{message.message_name}: {type(error).__name__}: {error}")
+
+        return callback
+
+    def _odometry(self, fields: dict[str, Any]) -> None:
+        self._counts["ODOMETRY"] += 1
+        self._times.append(int(fields["time_usec"]))
+        odometry = odometry_from_wire(fields)
+        if odometry is not None:
+            self.on_odometry(odometry)
+
+    def _imu(self, fields: dict[str, Any]) -> None:
+        self._counts["HIGHRES_IMU"] += 1
+        self.latest.specific_force = (fields["xacc"], -fields["yacc"], -fields["zacc"])
+
+    def _battery(self, fields: dict[str, Any]) -> None:
+        self._counts["BATTERY_STATUS"] += 1
+        cells = [mv for mv in fields["voltages"] + fields.get("voltages_ext", []) if mv not in (0, 0xFFFF)]
+        self.latest.battery_voltage = 1e-3 * sum(cells)
+
+    def _esc(self, fields: dict[str, Any]) -> None:
+        self._counts["ESC_STATUS"] += 1
+        first = int(fields["index"])
+        for i, rpm in enumerate(fields["rpm"]):
+            self._escs[first + i] = abs(rpm) * _RPM
+        self.latest.rotor_speed = tuple(self._escs[i] for i in sorted(self._escs))
+
+    def _heartbeat(self, fields: dict[str, Any]) -> None:
+        if fields["component"] != _AUTOPILOT:
+            return
+        self.latest.heartbeat = 1e-9 * fields["arrived"]
+        self.latest.armed = bool(int(fields["base_mode"]) & _ARMED)
+        self.latest.flight_mode = mode_name(int(fields["custom_mode"]))
+        self.on_state()
+
+    def _current_mode(self, fields: dict[str, Any]) -> None:
+        self.latest.flight_mode = mode_name(int(fields["custom_mode"]))
+        self.on_state()
+
+    def _landed(self, fields: dict[str, Any]) -> None:
+        self.latest.landed = _LANDED.get(int(fields["landed_state"]), "unknown")
+
+    def _text(self, fields: dict[str, Any]) -> None:
+        self.latest.texts.append(str(fields["text"]))
+
+
+def mode_name(custom_mode: int) -> str:
+    """PX4's flight mode of a heartbeat, as MAVSDK names it."""
+    main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
+    return _MODES.get((main, sub), _MODES.get((main, 0), "UNKNOWN"))
+
+
+def odometry_from_wire(fields: dict[str, Any]) -> Odometry | None:
+    """An ODOMETRY message (fields as on the wire, NED and FRD, `arrived` ns) in ENU and FLU.
+
+    The velocity is turned according to `child_frame_id`. None where a number that is needed is not there (PX4
+    sends NaN for an estimate it has not got) or the quaternion is not unit. Raises `ValueError` for a frame
+    that is unknown.
+    """
+    numbers = [fields[k] for k in ("x", "y", "z", "vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed")]
+    numbers += fields["q"]
+    if None in numbers or not math.isfinite(sum(numbers)):
+        return None
+    x, y, z, vx, vy, vz, p, q, r, w, i, j, k = numbers
+    size = w * w + i * i + j * j + k * k
+    if not 0.98 < size < 1.02:
+        return None
+    size = 1.0 / math.sqrt(size)
+    w, i, j, k = w * size, i * size, j * size, k * size
+    frame = fields["child_frame_id"]
+    if frame in _FRAMES_BODY_FRD:
+        # Body FRD to NED by the attitude: v + 2 q x (q x v + w v).
+        a, b, c = j * vz - k * vy + w * vx, k * vx - i * vz + w * vy, i * vy - j * vx + w * vz
+        vx, vy, vz = vx + 2 * (j * c - k * b), vy + 2 * (k * a - i * c), vz + 2 * (i * b - j * a)
+    elif frame not in _FRAMES_WORLD_NED:
+        raise ValueError(f"velocity in the frame {frame}, which is neither local NED nor body FRD")
+    # The same map as models.frames.enu_flu_from_ned_frd, for one sample.
+    attitude = (_ROOT_HALF * (w + k), _ROOT_HALF * (i + j), _ROOT_HALF * (i - j), _ROOT_HALF * (w - k))
+    return Odometry(
+        int(fields["time_usec"]),
+        fields["arrived"],
+        (y, x, -z),
+        (vy, vx, -vz),
+        attitude,
+        (p, -q, -r),
+        int(fields.get("reset_counter", 0)),
+    )
