@@ -3,8 +3,8 @@
 A sample counts as flying when thrust is on and, next to an idle stretch, when the vehicle has left the
 ground: it has risen 10 cm above where thrust came on. A file that starts in the air has
 no takeoff to cut. The same holds backwards for the landing. Without a position, half a second after thrust
-has reached its usual level is left out instead, and before it falls below that level; what is left then ends
-before a crash.
+has reached its usual level is left out instead, and before it falls below that level. Impacts are left out,
+and what follows a crash.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ SHORTEST_RUN = 1.0  # s
 # m/s², specific force of an impact: above what propellers of a quadrotor in a log give in free flight
 CRASH = 40.0
 CRASH_RATIO = 4.0  # times the usual specific force
+CRASHED = 3.0  # s of thrust after an impact below which it was a crash
 
 
 def flying_mask(t: np.ndarray, columns: dict[str, np.ndarray], vehicle: Vehicle) -> np.ndarray:
@@ -38,7 +39,7 @@ def flying_mask(t: np.ndarray, columns: dict[str, np.ndarray], vehicle: Vehicle)
             last = _landing(t, columns, a, b) if b < part.stop else b
             if last > first and t[last - 1] - t[first] >= SHORTEST_RUN:
                 flying[first:last] = True
-    return flying & ~_after_impact(t, columns, flying)
+    return flying & ~_impacts(t, columns, flying)
 
 
 def _runs(on: np.ndarray, t: np.ndarray, dip: float) -> list[tuple[int, int]]:
@@ -74,8 +75,8 @@ def _landing(t: np.ndarray, columns: dict[str, np.ndarray], a: int, b: int) -> i
     return int(np.searchsorted(t, t[b - 1 - int(np.argmax(usual[::-1]))] - SETTLE))
 
 
-def _after_impact(t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndarray) -> np.ndarray:
-    """Samples of a flying run from a tenth of a second before an impact to the end of that run."""
+def _impacts(t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndarray) -> np.ndarray:
+    """Samples around an impact; after a crash, when flight ends soon, also all that follows in that run."""
     hit = np.zeros(len(t), dtype=bool)
     f = columns.get("specific_force")
     if f is None or not np.any(flying):
@@ -84,8 +85,12 @@ def _after_impact(t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndar
     limit = max(CRASH, CRASH_RATIO * float(np.median(norm[flying])))
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flying.astype(np.int8), [0]])))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
-        over = np.flatnonzero(norm[a:b] > limit)
+        over = a + np.flatnonzero(norm[a:b] > limit)
         # One sample is a spike of the sensor; an impact rings.
-        if over.size > 1:
-            hit[int(np.searchsorted(t, t[a + int(over[0])] - 0.1)) : b] = True
+        if over.size < 2:
+            continue
+        for row in over:
+            hit[np.searchsorted(t, t[row] - 0.1) : np.searchsorted(t, t[row] + SETTLE)] = True
+        if t[b - 1] - t[over[-1]] < CRASHED:
+            hit[over[-1] : b] = True
     return hit

@@ -122,16 +122,16 @@ def assemble(
     dt = float(np.median(np.diff(t)))
     seconds = float(in_air.sum()) * dt
     if seconds < plausible.SHORTEST:
+        cut = " (the log may be cut short)" if any("cut" in note for note in said) else ""
         raise InputError(
-            f"{origin}: only {seconds:.1f} s of {t[-1] - t[0]:.1f} s are in the air; at least "
-            f"{plausible.SHORTEST:g} s are needed (check hover_thrust of the vehicle file, or fly longer)"
+            f"{origin}: only {seconds:.1f} s of {t[-1] - t[0]:.1f} s are in the air{cut}; at least "
+            f"{plausible.SHORTEST:g} s are needed: fly longer, or check hover_thrust of the vehicle file"
         )
     if not np.all(in_air):
         first, last = t[in_air][0], t[in_air][-1]
         said.append(
-            f"{seconds:.1f} s of {t[-1] - t[0]:.1f} s are in the air, from t = {first:.1f} to {last:.1f} "
-            "s; the "
-            "(ground, takeoff, landing) is left out"
+            f"{seconds:.1f} s of {t[-1] - t[0]:.1f} s are in the air, between t = {first:.1f} and "
+            f"{last:.1f} s; the rest (ground, takeoff, landing, fragments) is left out"
         )
     plausible.check_specific_force(given, in_air, origin)
     plausible.check_attitude(t, given, in_air, origin)
