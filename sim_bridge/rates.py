@@ -52,8 +52,8 @@ class Mixer:
         t2 = a2 * collective + b2 * roll + c2 * pitch + d2 * yaw
         t3 = a3 * collective + b3 * roll + c3 * pitch + d3 * yaw
         top = self._top
-        low, high = min(t0, t1, t2, t3), max(t0, t1, t2, t3)
-        self.saturated = low < IDLE_SHARE or high > top
+        low = IDLE_SHARE
+        self.saturated = not (low <= t0 <= top and low <= t1 <= top and low <= t2 <= top and low <= t3 <= top)
         if self.saturated:
             t0, t1, t2, t3 = self._give_way(collective, roll, pitch, yaw)
         hover = self._hover
@@ -129,20 +129,25 @@ class RateController:
         dt = self.dt
         (kp, ki, kd), (kp2, ki2, kd2), (kp3, ki3, _) = self._gains
         smooth = self._smooth
-        self._dp += smooth * ((p - self._p) / dt - self._dp)
-        self._dq += smooth * ((q - self._q) / dt - self._dq)
-        self._p, self._q = p, q
+        dp = self._dp = self._dp + smooth * ((p - self._p) / dt - self._dp)
+        dq = self._dq = self._dq + smooth * ((q - self._q) / dt - self._dq)
+        self._p = p
+        self._q = q
         ep, eq, er = p_set - p, q_set - q, r_set - r
         mixer = self.mixer
         motors = mixer.mix(
             mixer.relative(command),
-            kp * ep + self._ip - kd * self._dp,
-            kp2 * eq + self._iq - kd2 * self._dq,
+            kp * ep + self._ip - kd * dp,
+            kp2 * eq + self._iq - kd2 * dq,
             kp3 * er + self._ir,
         )
         if not mixer.saturated:
+            # Comparisons instead of min and max: this runs 500 times a simulated second.
             lp, lq, lr = self._limits
-            self._ip = min(max(self._ip + ki * ep * dt, -lp), lp)
-            self._iq = min(max(self._iq + ki2 * eq * dt, -lq), lq)
-            self._ir = min(max(self._ir + ki3 * er * dt, -lr), lr)
+            i = self._ip + ki * ep * dt
+            self._ip = i if -lp < i < lp else (lp if i > 0 else -lp)
+            i = self._iq + ki2 * eq * dt
+            self._iq = i if -lq < i < lq else (lq if i > 0 else -lq)
+            i = self._ir + ki3 * er * dt
+            self._ir = i if -lr < i < lr else (lr if i > 0 else -lr)
         return motors

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mujoco
+
 from models.vehicle import Vehicle
 from sim_bridge.rates import RateController
 from sim_bridge.truth.airframe import Airframe, believed_powertrain
@@ -24,6 +26,9 @@ class Simulator:
     ) -> None:
         self.vehicle = vehicle
         self.world = World(vehicle)
+        # Bound once: looking these up in every step would cost as much as the inner loop.
+        self._position, self._velocity, self._wrench = self.world.position, self.world.velocity, self.world.wrench
+        self._mj_step, self._model, self._data = mujoco.mj_step, self.world.model, self.world.data
         self.sensors = Sensors(Noise() if noise is None else noise, seed)
         powertrain, self.airframe = install(vehicle, hidden, believed_powertrain(vehicle), self.sensors, PHYSICS_STEP)
         self.rates = RateController(vehicle, PHYSICS_STEP)
@@ -35,7 +40,6 @@ class Simulator:
         self._line = [(0.0, 0.0, 0.0, 0.0)] * (whole + 2)
         self._whole = whole
         self._cursor = 0
-        self._speed_before = (0.0, 0.0, 0.0)
         self._estimate: Estimate | None = None
 
     def start_in_hover(
@@ -49,14 +53,16 @@ class Simulator:
         hover = self.vehicle.hover_thrust
         self.airframe.spin(self.airframe.speed_of(hover))
         self._line = [(hover, 0.0, 0.0, 0.0)] * len(self._line)
-        self._speed_before = velocity
         self._estimate = None
 
     def step(self, command: float, p: float, q: float, r: float) -> None:
         """One physics step with the rotors running under a collective command and body-rate setpoints."""
         line = self._line
         size = len(line)
-        cursor = self._cursor = (self._cursor + 1) % size
+        cursor = self._cursor + 1
+        if cursor == size:
+            cursor = 0
+        self._cursor = cursor
         line[cursor] = (command, p, q, r)
         newer = cursor - self._whole
         c1, p1, q1, r1 = line[newer]
@@ -67,9 +73,13 @@ class Simulator:
             p1 += late * (p0 - p1)
             q1 += late * (q0 - q1)
             r1 += late * (r0 - r1)
-        velocity = self.world.velocity
-        self.motors = motors = self.rates.motors(c1, p1, q1, r1, velocity[3], velocity[4], velocity[5])
-        self._advance(motors)
+        velocity = self._velocity.tolist()
+        _, _, _, wx, wy, wz = velocity
+        self.motors = motors = self.rates.motors(c1, p1, q1, r1, wx, wy, wz)
+        self.airframe.act(self._position.tolist(), velocity, motors, self._wrench)
+        self._mj_step(self._model, self._data)
+        self.time_us += _STEP_US
+        self._estimate = None
 
     def rest(self) -> None:
         """One physics step with the motors stopped (disarmed or killed)."""
@@ -77,13 +87,8 @@ class Simulator:
         self._cursor = (self._cursor + 1) % len(self._line)
         self._line[self._cursor] = (0.0, 0.0, 0.0, 0.0)
         self.rates.reset()
-        self._advance(self.motors)
-
-    def _advance(self, motors: list[float]) -> None:
         world = self.world
-        velocity = world.velocity
-        self._speed_before = (velocity[0], velocity[1], velocity[2])
-        self.airframe.act(world.position, velocity, motors, world.wrench)
+        self.airframe.act(world.position.tolist(), world.velocity.tolist(), self.motors, world.wrench)
         world.step()
         self.time_us += _STEP_US
         self._estimate = None
@@ -93,11 +98,10 @@ class Simulator:
         if self._estimate is None:
             world, m = self.world, self.airframe.motion
             position, velocity = world.position.tolist(), world.velocity.tolist()
-            bx, by, bz = self._speed_before
             rotation = (m.r00, m.r01, m.r02, m.r10, m.r11, m.r12, m.r20, m.r21, m.r22)
             # Before the first step there is none to take the acceleration from: the vehicle stands or hovers.
             rate = 1.0 / PHYSICS_STEP if self.time_us else 0.0
-            acceleration = ((velocity[0] - bx) * rate, (velocity[1] - by) * rate, (velocity[2] - bz) * rate)
+            acceleration = ((velocity[0] - m.vx) * rate, (velocity[1] - m.vy) * rate, (velocity[2] - m.vz) * rate)
             self._estimate = self.sensors.sample(
                 self.time_us, position, velocity, acceleration, rotation, m.voltage, m.speeds
             )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import sqrt
 
 from models.vehicle import Vehicle
 from sim_bridge.truth.battery import Battery, BatteryCell, battery_for
@@ -119,7 +120,7 @@ class Airframe:
         tau = powertrain.time_constant
         self._follow = 1.0 - math.exp(-dt / tau) if tau > 0 else 1.0
         self._power_per_speed = powertrain.torque_per_thrust / _MOTOR_EFFICIENCY
-        self._steps_to_discharge = 0
+        self._steps = 0
 
     def speed_of(self, command: float) -> float:
         """Rotor speed, rad/s, that a motor command (normalised) settles at."""
@@ -134,14 +135,15 @@ class Airframe:
         """Set all rotors to a speed (rad/s), to start a simulation in the air."""
         self.motion.speeds[:] = (speed,) * 4
 
-    def act(self, position: memoryview, velocity: memoryview, commands: list[float], wrench: memoryview) -> None:
+    def act(self, position: list[float], velocity: list[float], commands: list[float], wrench: memoryview) -> None:
         """Advance the rotors by one step and write force (world) and torque (body) of that step into `wrench`.
 
-        `position` and `velocity` are those of `World`; `commands` the four motor commands, 0 to 1.
+        `position` (x, y, z, quaternion) and `velocity` (linear, angular) are those of `World`; `commands` the four
+        motor commands, 0 to 1.
         """
         m = self.motion
-        m.x, m.y, m.z, qw, qx, qy, qz = position.tolist()
-        m.vx, m.vy, m.vz, m.p, m.q, m.r = velocity.tolist()
+        m.x, m.y, m.z, qw, qx, qy, qz = position
+        m.vx, m.vy, m.vz, m.p, m.q, m.r = vx, vy, vz, _, _, _ = velocity
         xx, yy, zz = 2.0 * qx * qx, 2.0 * qy * qy, 2.0 * qz * qz
         xy, xz, yz = 2.0 * qx * qy, 2.0 * qx * qz, 2.0 * qy * qz
         wx, wy, wz = 2.0 * qw * qx, 2.0 * qw * qy, 2.0 * qw * qz
@@ -149,7 +151,7 @@ class Airframe:
         m.r10, m.r11, m.r12 = r10, r11, r12 = xy + wz, 1.0 - xx - zz, yz - wx
         m.r20, m.r21, m.r22 = r20, r21, r22 = xz - wy, yz + wx, 1.0 - xx - yy
         wind = self.wind
-        ax, ay, az = m.vx - wind[0], m.vy - wind[1], m.vz - wind[2]
+        ax, ay, az = vx - wind[0], vy - wind[1], vz - wind[2]
         m.u = r00 * ax + r10 * ay + r20 * az
         m.v = r01 * ax + r11 * ay + r21 * az
         m.w = r02 * ax + r12 * ay + r22 * az
@@ -160,30 +162,31 @@ class Airframe:
         linear, follow = train.linear, self._follow
         speeds, thrusts = m.speeds, m.thrusts
         power = 0.0
-        for i in (0, 1, 2, 3):
-            ratio = commands[i] / hover_command
+        i = 0
+        for command in commands:
+            ratio = command / hover_command
             if linear:
-                target = ratio**0.5
+                target = sqrt(ratio)
                 if blend:
                     target += blend * (ratio - target)
             else:
-                target = ratio + blend * (ratio**0.5 - ratio) if blend else ratio
+                target = ratio + blend * (sqrt(ratio) - ratio)
             before = speeds[i]
             change = follow * (hover_speed * target - before)
             speeds[i] = before + change
             # The mean speed of the step, so that the lag is the believed one and not half a step more.
             middle = before + 0.5 * change
-            thrust = constants[i] * middle * middle
-            thrusts[i] = thrust
+            thrusts[i] = thrust = constants[i] * middle * middle
             power += thrust * middle
+            i += 1
         m.voltage = self.battery.load(power * self._power_per_speed + _AVIONICS_POWER)
-        self._steps_to_discharge -= 1
-        if self._steps_to_discharge <= 0:
-            self._steps_to_discharge = _DISCHARGE_STEPS
+        self._steps += 1
+        if self._steps % _DISCHARGE_STEPS == 0:
             self.battery.discharge(_DISCHARGE_STEPS * self.dt)
 
-        for act in self.on_rotors:
-            act(m)
+        if self.on_rotors:
+            for act in self.on_rotors:
+                act(m)
         t0, t1, t2, t3 = thrusts
         (x0, y0, c0), (x1, y1, c1), (x2, y2, c2), (x3, y3, c3) = self._arms
         body = m.wrench

@@ -1,0 +1,286 @@
+"""Flights without MAVLink: the same world and inner autopilot, flown by the companion's own control law.
+
+Many times faster than real time, and the same every time: what a flight becomes depends on the plan alone.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from companion.control import ControlLaw, ControlStep, State
+from companion.guard import Guard
+from companion.inference import check_model
+from models.design import Design
+from models.errors import InputError
+from models.flight import COLUMNS
+from models.record import FlightRecorder
+from models.record_pb2 import Event, Tick
+from models.trajectory import ReferenceSample, Trajectory, transfer
+from models.vehicle import Vehicle
+from sim_bridge.simulator import Simulator
+from sim_bridge.truth.hidden import Hidden
+from sim_bridge.truth.sensors import Estimate, Noise
+from sim_bridge.world import PHYSICS_STEP
+
+_LOST = 4.0  # m from the reference at which a flight is given up, as the companion does
+_BETWEEN_SPEED, _BETWEEN_ACCELERATION = 1.5, 2.0  # m/s, m/s²: from the end back to the start
+_TICK_EVENT_LEVELS = {"finished": "info", "lost": "error", "crashed": "error"}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One flight: who flies what, with what hidden. `rate` of the control law in Hz, `model` an ONNX file's bytes.
+
+    With a `model` the companion's guard corrects the cascade, as controller `corrected`; otherwise it flies `lqr`.
+    """
+
+    vehicle: Vehicle
+    design: Design
+    trajectory: Trajectory
+    hidden: tuple[Hidden, ...] = ()
+    seed: int = 0
+    repeat: int = 1
+    rate: float = 100.0
+    model: bytes | None = None
+    noise: Noise | None = None
+
+    @property
+    def steps_per_tick(self) -> int:
+        """Physics steps between two control ticks. Raises `InputError` where the rates do not divide."""
+        steps = 1.0 / (self.rate * PHYSICS_STEP)
+        if not math.isclose(steps, round(steps), rel_tol=1e-9) or round(steps) < 1:
+            physics = round(1 / PHYSICS_STEP)
+            raise InputError(f"--rate {self.rate:g}: must divide the physics rate of {physics} Hz (50, 100, 250, 500)")
+        return round(steps)
+
+
+class Sample(NamedTuple):
+    """One control tick: what the vehicle knew (home frame), what was asked, what was commanded."""
+
+    estimate: Estimate
+    position: tuple[float, float, float]
+    reference: ReferenceSample
+    step: ControlStep
+    motors: list[float]
+    guard: str
+    inference: float
+
+
+@dataclass(frozen=True)
+class Flown:
+    """How a flight went. Errors are RMS of position against the reference, m, per axis of the world."""
+
+    outcome: str
+    ticks: int
+    simulated: float
+    wall: float
+    rms_error: tuple[float, float, float]
+    guard: str
+
+    @property
+    def times_real_time(self) -> float:
+        """Simulated over wall time, everything included."""
+        return self.simulated / self.wall if self.wall > 0 else math.inf
+
+
+def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
+    """Fly a plan from hover at the start of its trajectory; `on_sample` is called once a control tick.
+
+    Positions are in the home frame: origin where the vehicle's centre of mass is when it stands on the ground, z
+    up, axes of the world. Raises `InputError` for a design or a model that belongs to another vehicle.
+    """
+    vehicle = plan.vehicle
+    law = ControlLaw(vehicle, plan.design)
+    guard, steps = _guard(plan), plan.steps_per_tick
+    simulator = Simulator(vehicle, plan.hidden, plan.seed, plan.noise)
+    ground = simulator.world.standing_height
+    x, y, z, yaw = plan.trajectory.start
+    simulator.start_in_hover((x, y, z + ground), yaw)
+    period = steps * PHYSICS_STEP
+    squares = [0.0, 0.0, 0.0]
+    ticks, outcome = 0, "finished"
+    if guard is not None:
+        guard.start()
+    estimate, step = simulator.estimate, simulator.step
+    status, inference = "off", 0.0
+    begin = time.perf_counter()
+    for reference in _references(plan, period):
+        now = estimate()
+        px, py, pz = now.position
+        position = (px, py, pz - ground)
+        state = State(position, now.velocity, now.quaternion, position[2], now.battery_voltage)
+        control = law.step(state, reference, period if ticks else 0.0, guard)
+        if guard is not None:
+            status, inference = guard.status, guard.inference_time
+        on_sample(Sample(now, position, reference, control, simulator.motors, status, inference))
+        ticks += 1
+        rx, ry, rz = reference.position
+        ex, ey, ez = px - rx, py - ry, position[2] - rz
+        squares[0] += ex * ex
+        squares[1] += ey * ey
+        squares[2] += ez * ez
+        if ex * ex + ey * ey + ez * ez > _LOST * _LOST:
+            outcome = "lost"
+            break
+        if simulator.world.touching and pz < 0.6 * ground:
+            outcome = "crashed"
+            break
+        command = control.thrust_command
+        p, q, r = control.command.body_rate
+        for _ in range(steps):
+            step(command, p, q, r)
+    wall = time.perf_counter() - begin
+    a, b, c = (math.sqrt(total / ticks) for total in squares)
+    return Flown(outcome, ticks, ticks * period, wall, (a, b, c), status)
+
+
+def _guard(plan: Plan) -> Guard | None:
+    if plan.model is None:
+        return None
+    verdict = check_model(plan.model, plan.vehicle)
+    if verdict.model is None:
+        raise InputError(f"--model: refused: {verdict.reason}")
+    info = verdict.model.info
+    return Guard(verdict.model, info.features, wants_yaw=info.wants_yaw)
+
+
+def _references(plan: Plan, period: float) -> Iterator[ReferenceSample]:
+    """The trajectory as often as asked, with a transfer from its end back to its start in between."""
+    trajectory = plan.trajectory
+    back = None
+    if math.dist(trajectory.end, trajectory.start) > 1e-6:
+        back = transfer(trajectory.end, trajectory.start, _BETWEEN_SPEED, _BETWEEN_ACCELERATION)
+    legs = []
+    for turn in range(plan.repeat):
+        if turn and back is not None:
+            legs.append(back)
+        legs.append(trajectory)
+    offset, tick = 0.0, 0
+    for leg in legs:
+        while tick * period - offset < leg.duration:
+            yield leg.at(tick * period - offset)
+            tick += 1
+        offset += leg.duration
+
+
+def record(plan: Plan, path: Path, table: Path | None = None) -> Flown:
+    """Fly a plan into a flight record (MCAP), and into a CSV with the project's column names where asked."""
+    expected = plan.repeat * (plan.trajectory.duration + 60.0) * plan.rate
+    metadata = {"created_by": "sim-bridge fly", "trajectory": plan.trajectory.name, "seed": str(plan.seed)}
+    # The writer's thread is slower than the simulation: nothing may be dropped, so all of it has room to wait.
+    recorder = FlightRecorder(path, plan.vehicle, plan.design, metadata, queue_limit=int(expected) + 100)
+    tick = _TickWriter(plan, recorder)
+    rows: list[tuple[float, ...]] = []
+
+    def both(sample: Sample) -> None:
+        tick(sample)
+        rows.append(_row(sample))
+
+    try:
+        flown = fly(plan, tick if table is None else both)
+        level = _TICK_EVENT_LEVELS[flown.outcome]
+        recorder.event(Event(vehicle_time_us=tick.time_us, level=level, kind=flown.outcome, text=flown.outcome))
+    finally:
+        recorder.close(timeout=60.0)
+    if recorder.error:
+        raise InputError(recorder.error)
+    if table is not None:
+        _write_csv(table, rows)
+    return flown
+
+
+class _TickWriter:
+    """Turns samples into the protobuf ticks that the companion writes, and enqueues them."""
+
+    def __init__(self, plan: Plan, recorder: FlightRecorder) -> None:
+        self._recorder = recorder
+        self._interval = 1.0 / plan.rate
+        # What is the same in every tick is set once; each tick then overwrites all the rest.
+        self._tick = Tick(
+            controller="lqr" if plan.model is None else "corrected",
+            trajectory=plan.trajectory.name,
+            phase="mission",
+            flight_mode="OFFBOARD",
+            armed=True,
+            setpoint_sent=True,
+        )
+        if plan.model is not None:
+            from models.contract import model_hash
+
+            self._tick.model = model_hash(plan.model)
+        self.time_us = 0
+
+    def __call__(self, sample: Sample) -> None:
+        """Write one tick."""
+        tick, now, control, reference = self._tick, sample.estimate, sample.step, sample.reference
+        self.time_us = tick.vehicle_time_us = now.time_us
+        tick.host_time_ns = host = time.monotonic_ns()
+        v = tick.position
+        v.x, v.y, v.z = sample.position
+        v = tick.velocity
+        v.x, v.y, v.z = now.velocity
+        q = tick.quaternion
+        q.w, q.x, q.y, q.z = now.quaternion
+        v = tick.angular_velocity
+        v.x, v.y, v.z = now.angular_velocity
+        v = tick.specific_force
+        v.x, v.y, v.z = now.specific_force
+        v = tick.position_reference
+        v.x, v.y, v.z = reference.position
+        v = tick.velocity_reference
+        v.x, v.y, v.z = reference.velocity
+        v = tick.acceleration_reference
+        v.x, v.y, v.z = reference.acceleration
+        tick.yaw_reference = reference.yaw
+        feedback = control.feedback
+        tick.feedback.thrust = feedback.thrust
+        v = tick.feedback.body_rate
+        v.x, v.y, v.z = feedback.body_rate
+        v = tick.correction
+        v.x, v.y, v.z = control.correction
+        v = tick.correction_raw
+        v.x, v.y, v.z = control.correction_raw
+        tick.thrust_command = control.thrust_command
+        v = tick.body_rate_command
+        v.x, v.y, v.z = control.command.body_rate
+        tick.battery_voltage = now.battery_voltage
+        tick.rotor_speed[:] = now.rotor_speed
+        tick.guard = sample.guard
+        tick.inference = sample.inference
+        tick.interval = self._interval
+        self._recorder.tick(tick.SerializeToString(), now.time_us, host)
+
+
+_TABLE_COLUMNS = (
+    *("position", "velocity", "quaternion", "angular_velocity", "specific_force", "thrust_command"),
+    *("body_rate_command", "battery_voltage", "position_reference", "velocity_reference", "acceleration_reference"),
+    *("yaw_reference", "rotor_speed", "motor_command"),
+)
+
+
+def _row(sample: Sample) -> tuple[float, ...]:
+    now, control, reference = sample.estimate, sample.step, sample.reference
+    return (
+        now.time_us * 1e-6,
+        *(*sample.position, *now.velocity, *now.quaternion, *now.angular_velocity, *now.specific_force),
+        *(control.thrust_command, *control.command.body_rate, now.battery_voltage),
+        *(*reference.position, *reference.velocity, *reference.acceleration, reference.yaw),
+        *(*now.rotor_speed, *sample.motors),
+    )
+
+
+def _write_csv(path: Path, rows: list[tuple[float, ...]]) -> None:
+    names = ["t"] + [name for column in _TABLE_COLUMNS for name in COLUMNS[column][0]]
+    try:
+        with path.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(names)
+            writer.writerows([f"{value:.7g}" for value in row] for row in rows)
+    except OSError as error:
+        raise InputError(f"{path}: cannot write the table ({error.strerror})") from None
