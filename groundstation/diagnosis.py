@@ -160,14 +160,16 @@ class _Search:
     def run(self) -> Diagnosis:
         """Select, exchange, judge."""
         current = self.state(())
+        visited = {frozenset(current.added)}
         while len(current.added) < MOST_EFFECTS:
             self.progress(f"{len(current.added)} effects found, looking for the next")
             following = self._forward(current)
             if following is None:
                 break
             following = self._backward(following)
-            if set(following.added) == set(current.added):
+            if frozenset(following.added) in visited:
                 break
+            visited.add(frozenset(following.added))
             current = following
         current = self._agrees_with_held_out(current)
         return self._report(current)

@@ -100,7 +100,7 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
                 world[piece] = ndimage.correlate1d(world[piece], [0.25, 0.5, 0.25], axis=0, mode="nearest")
             return rotate_inverse(quaternion, low_pass(world)[rows])
 
-        value = rotate_inverse(quaternion, ([*low_pass(slope(raw)), 0.0, 0.0, GRAVITY])[rows])
+        value = rotate_inverse(quaternion, (low_pass(slope(raw)) + np.array([0.0, 0.0, GRAVITY]))[rows])
     else:
 
         def see(force: np.ndarray) -> np.ndarray:
