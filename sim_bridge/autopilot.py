@@ -76,7 +76,8 @@ class Autopilot:
         self._offboard_us = -(10**12)
         self._target: MotionSetpoint = MotionSetpoint()
         self._steps = 0
-        self._armed_us = self._landed_us = self._mode_us = 0
+        self.armed_us = 0
+        self._landed_us = 0
         self._quiet_us: int | None = None
         self._flown = False
 
@@ -88,7 +89,9 @@ class Autopilot:
     # Requests
 
     def offboard(self, setpoint: Setpoint) -> None:
-        """Take a setpoint from the companion; it acts in Offboard, and keeps Offboard available in other modes."""
+        """Take a setpoint from the companion; it acts in Offboard, and keeps Offboard available in other
+        modes.
+        """
         self._offboard = setpoint
         self._offboard_us = self.time_us
 
@@ -113,7 +116,6 @@ class Autopilot:
             return
         now = self.simulator.estimate()
         self.mode = mode
-        self._mode_us = self.time_us
         self.attitude = None
         if mode is not Mode.OFFBOARD:
             # Offboard by rates leaves no trace in the position loop; start it from what flies now.
@@ -165,7 +167,7 @@ class Autopilot:
             self.notices.append((3, "Arming denied: " + refusals[0]))
             return Verdict.TEMPORARILY_REJECTED
         self.armed = True
-        self._armed_us = self.time_us
+        self.armed_us = self.time_us
         self._flown = False
         self.failsafe = ""
         self.home = self.simulator.estimate().position
@@ -219,7 +221,8 @@ class Autopilot:
             self.simulator.rest()
             return
         if self.mode is Mode.OFFBOARD and isinstance(self._offboard, RateSetpoint):
-            # Straight through: a rate setpoint acts in the step after its arrival, not at the next outer tick.
+            # Straight through: a rate setpoint acts in the step after its arrival, not at the next outer
+            # tick.
             self.attitude = None
             self.thrust, self.rates = self._offboard.thrust, self._offboard.rates
         if self.landed is Landed.ON_GROUND and self.thrust < 0.5 * self.simulator.vehicle.hover_thrust:
@@ -275,7 +278,7 @@ class Autopilot:
         return setpoint.position[2] > z + 0.1 or setpoint.velocity[2] > 0.05 or setpoint.acceleration[2] > 0.5
 
     def _return_home(self, position: Vector) -> None:
-        x, y, z = self._target.position
+        z = self._target.position[2]
         hx, hy, _ = self.home
         if abs(position[2] - z) < 0.5:
             self._target = MotionSetpoint((hx, hy, z), yaw=self._target.yaw)
@@ -297,7 +300,7 @@ class Autopilot:
             before_flight = self.parameters["COM_DISARM_PRFLT"]
             if self._flown and after_flight > 0 and now - self._landed_us > after_flight * 1e6:
                 self._stop("Disarmed by landing")
-            elif not self._flown and before_flight > 0 and now - self._armed_us > before_flight * 1e6:
+            elif not self._flown and before_flight > 0 and now - self.armed_us > before_flight * 1e6:
                 self._stop("Disarmed by auto preflight disarming")
 
     def _offboard_lost(self) -> None:

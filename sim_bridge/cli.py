@@ -1,53 +1,331 @@
-"""Command line of the simulation bridge."""
+"""Command line of the simulation bridge. Heavy imports wait until a command needs them."""
 
 from __future__ import annotations
 
 import json
 import signal
+import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from models.errors import InputError, run_command_line
+from models.vehicle import Vehicle, load_vehicle
+from sim_bridge.settings import Settings, load_settings
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-
-
-@app.callback()
-def _root() -> None:
-    """A simulated vehicle that behaves as a PX4 would, with physical effects to hide in it."""
-
-
-@app.command()
-def run(
-    vehicle: Annotated[Path, typer.Option(help="vehicle.toml: what its owner believes")],
-    hidden: Annotated[list[str], typer.Option(help="effect to hide: NAME, NAME:SIZE, random or none")] = ["none"],  # noqa: B006
-    seed: int = 0,
-    mavlink: str = "udpout:127.0.0.1:14540",
-    port: int = 14580,
-    speed: float = 1.0,
-    pilot_port: int = 14590,
-) -> None:
-    """Simulate one vehicle on MAVLink until interrupted."""
-    from models.vehicle import load_vehicle
+if TYPE_CHECKING:
     from sim_bridge.autopilot import Autopilot
-    from sim_bridge.mavlink.server import Link, Server
-    from sim_bridge.parameters import Parameters
-    from sim_bridge.simulator import Simulator
+    from sim_bridge.in_process import Sample
+    from sim_bridge.truth.hidden import Hidden
+
+app = typer.Typer(
+    name="sim-bridge",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="A simulated vehicle that behaves as a PX4 would, with physical effects to hide in it.",
+)
+
+VehicleFile = Annotated[
+    Path | None, typer.Option(help="Vehicle file (vehicle.toml): what its owner believes.")
+]
+Config = Annotated[Path | None, typer.Option(help="Configuration (sim-bridge.toml); flags override it.")]
+HiddenNames = Annotated[
+    list[str] | None, typer.Option(help="Effect to hide: NAME, NAME:SIZE, random, none. Repeatable.")
+]
+HiddenCount = Annotated[int | None, typer.Option(help="How many effects `random` draws.")]
+Seed = Annotated[int | None, typer.Option(help="Of the draw and of the noise.")]
+Sealed = Annotated[Path | None, typer.Option(help="Where the answer to `random` goes, for `reveal`.")]
+NoiseScale = Annotated[
+    float | None, typer.Option(help="Scale of sensor noise and estimator errors; 0: none.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def _tell(value: dict[str, Any], text: str, as_json: bool) -> None:
+    typer.echo(json.dumps(value) if as_json else text)
+
+
+def _hide(settings: Settings, vehicle: Vehicle, default: Path) -> tuple[tuple[Hidden, ...], Path | None]:
+    """What is hidden, and where the answer was sealed (None: the user knows it already)."""
+    from sim_bridge.seal import seal
     from sim_bridge.truth.hidden import choose
 
-    believed = load_vehicle(vehicle)
-    simulator = Simulator(believed, choose(hidden, believed, seed), seed)
-    autopilot = Autopilot(simulator, Parameters(believed))
-    host, number = mavlink.split(":")[-2:]
-    server = Server(autopilot, Link(("127.0.0.1", port), (host, int(number)), pilot_port), speed)
+    hidden = choose(list(settings.hidden), vehicle, settings.seed, settings.hidden_count)
+    path = Path(settings.sealed) if settings.sealed else default
+    if not settings.sealed and "random" not in settings.hidden:
+        return hidden, None
+    seal(hidden, vehicle.name, settings.seed, path)
+    return hidden, path
+
+
+def _told(settings: Settings, sealed: Path | None) -> str:
+    names = ", ".join(settings.hidden)
+    return f"hidden: {names}" + (f" (the answer is sealed in {sealed})" if sealed else "")
+
+
+@app.command(
+    epilog="Example: sim-bridge run --vehicle models/vehicles/quad5/vehicle.toml --hidden random --seed 7"
+)
+def run(
+    vehicle: VehicleFile = None,
+    config: Config = None,
+    hidden: HiddenNames = None,
+    hidden_count: HiddenCount = None,
+    seed: Seed = None,
+    sealed: Sealed = None,
+    noise: NoiseScale = None,
+    mavlink: Annotated[str | None, typer.Option(help="The companion's address: udpout:HOST:PORT.")] = None,
+    port: Annotated[int | None, typer.Option(help="The vehicle's own UDP port on 127.0.0.1.")] = None,
+    pilot_port: Annotated[int | None, typer.Option(help="UDP port of the simulated pilot; 0: none.")] = None,
+    speed: Annotated[float | None, typer.Option(help="Simulated over wall time.")] = None,
+    pilot_takes_over_at: Annotated[float | None, typer.Option(help="s after arming; 0: never.")] = None,
+    pilot_mode: Annotated[str | None, typer.Option(help="Mode the pilot then takes over with.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="End after so many s of simulated time; 0: never.")
+    ] = None,
+    param: Annotated[
+        list[str] | None, typer.Option(help="Parameter of the autopilot, NAME=VALUE. Repeatable.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Fly a simulated vehicle on MAVLink, as PX4 would, until interrupted.
+
+    Prints a line that begins with `ready:` as soon as it can be connected to. Faster than real time
+    (`--speed`) the vehicle's clock and all its messages run faster; MAVSDK's heartbeats, timeouts and re-sent
+    setpoints do not, so with MAVSDK speeds above about 4 make Offboard's loss timeout too short.
+    """
+    names = ("vehicle", "hidden", "hidden_count", "seed", "sealed", "noise", "mavlink", "port", "pilot_port")
+    flags = {name: value for name, value in locals().items() if name in names}
+    flags |= {"speed": speed, "duration": duration, "pilot_mode": pilot_mode}
+    settings = load_settings(config, flags | {"pilot_takes_over_at": pilot_takes_over_at})
+    believed = load_vehicle(settings.vehicle)
+    from sim_bridge.autopilot import Autopilot
+    from sim_bridge.mavlink.server import PILOT_MODES, Link, Server, pilot_order
+    from sim_bridge.parameters import Parameters
+    from sim_bridge.simulator import Simulator
+
+    if settings.pilot_mode not in PILOT_MODES:
+        raise InputError(f"--pilot-mode {settings.pilot_mode}: choose one of {', '.join(PILOT_MODES)}")
+    parameters = Parameters(believed)
+    for name, value in settings.parameters.items():
+        parameters.set_text(f"{name}={value}")
+    for assignment in param or ():
+        parameters.set_text(assignment)
+    link = Link(("127.0.0.1", settings.port), settings.remote, settings.pilot_port)
+    effects, answer = _hide(settings, believed, Path("hidden.sealed"))
+    autopilot = Autopilot(Simulator(believed, effects, settings.seed, settings.sensor_noise), parameters)
+    server = Server(autopilot, link, settings.speed)
     stopped: list[int] = []
-    for number_ in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number_, lambda caught, frame: stopped.append(caught))
-    print(f"ready: {believed.name} on MAVLink, sending to {mavlink}", flush=True)
-    server.run(lambda: not stopped)
-    server.close()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda caught, frame: stopped.append(caught))
+
+    takeover_us = settings.pilot_takes_over_at * 1e6
+    end_us = settings.duration * 1e6 or float("inf")
+    pilot_waits = [takeover_us > 0]
+
+    def each_step(time_us: int) -> None:
+        if pilot_waits[0] and autopilot.armed and time_us - autopilot.armed_us >= takeover_us:
+            pilot_waits[0] = False
+            pilot_order(autopilot, settings.pilot_mode)
+        if time_us >= end_us:
+            stopped.append(0)
+
+    ready = {
+        "ready": True,
+        "vehicle": believed.name,
+        "mavlink": settings.mavlink,
+        "port": settings.port,
+        "pilot_port": settings.pilot_port,
+        "speed": settings.speed,
+        "sealed": str(answer) if answer else None,
+    }
+    pace = "" if settings.speed == 1 else f", {settings.speed:g} times real time"
+    _tell(
+        ready, f"ready: {believed.name} sends to {settings.mavlink}{pace}; {_told(settings, answer)}", as_json
+    )
+    sys.stdout.flush()
+    try:
+        server.run(lambda: not stopped, each_step)
+    finally:
+        server.close()
+    _tell(_summary(autopilot), f"stopped after {autopilot.time_us * 1e-6:.1f} s of simulated time", as_json)
+
+
+def _summary(autopilot: Autopilot) -> dict[str, Any]:
+    return {"simulated": autopilot.time_us * 1e-6, "armed": autopilot.armed, "mode": autopilot.mode.name}
+
+
+@app.command(
+    epilog="Example: sim-bridge fly --trajectory excitation --vehicle vehicle.toml --hidden random -o 1.mcap"
+)
+def fly(
+    trajectory: Annotated[str, typer.Option(help="Name of a trajectory, or a CSV file of setpoints.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The flight record to write (MCAP).")],
+    vehicle: VehicleFile = None,
+    config: Config = None,
+    design: Annotated[
+        Path | None, typer.Option(help="Design file; otherwise design.json beside the vehicle.")
+    ] = None,
+    parameter: Annotated[
+        list[str] | None, typer.Option("--parameter", "-p", help="Of the trajectory, NAME=VALUE. Repeatable.")
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="ONNX model; the guarded correction then flies with it.")
+    ] = None,
+    repeat: Annotated[int, typer.Option(help="How often the trajectory is flown.", min=1)] = 1,
+    rate: Annotated[float, typer.Option(help="Control rate, Hz.")] = 100.0,
+    hidden: HiddenNames = None,
+    hidden_count: HiddenCount = None,
+    seed: Seed = None,
+    sealed: Sealed = None,
+    noise: NoiseScale = None,
+    table: Annotated[bool, typer.Option("--csv", help="Write a CSV beside the record, too.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Fly in-process, without MAVLink, by the companion's own control law, and write the same flight
+    record.
+    """
+    names = ("vehicle", "design", "hidden", "hidden_count", "seed", "sealed", "noise")
+    settings = load_settings(config, {name: value for name, value in locals().items() if name in names})
+    believed = load_vehicle(settings.vehicle)
+    from models.design import load_design
+    from sim_bridge.in_process import Plan, record
+
+    gains = Path(settings.design) if settings.design else Path(settings.vehicle).with_name("design.json")
+    plan = Plan(
+        believed,
+        load_design(gains, believed),
+        _trajectory(trajectory, parameter or []),
+        *_hide(settings, believed, output.with_suffix(".sealed"))[:1],
+        settings.seed,
+        repeat,
+        rate,
+        None if model is None else _bytes(model),
+        settings.sensor_noise,
+    )
+    csv_file = output.with_suffix(".csv") if table else None
+    with _Progress(plan.repeat * plan.trajectory.duration * rate, as_json) as progress:
+        flown = record(plan, output, csv_file, progress)
+    answer = Path(settings.sealed) if settings.sealed else output.with_suffix(".sealed")
+    told = answer if settings.sealed or "random" in settings.hidden else None
+    report = {
+        "record": str(output),
+        "csv": str(csv_file) if csv_file else None,
+        "outcome": flown.outcome,
+        "ticks": flown.ticks,
+        "simulated": flown.simulated,
+        "times_real_time": flown.times_real_time,
+        "rms_error": {"x": flown.rms_error[0], "y": flown.rms_error[1], "z": flown.rms_error[2], "unit": "m"},
+        "guard": flown.guard,
+        "sealed": str(told) if told else None,
+    }
+    error = ", ".join(f"{axis} {value:.3f}" for axis, value in zip("xyz", flown.rms_error, strict=True))
+    text = (
+        f"{output}: {flown.outcome}, {flown.simulated:.1f} s in {flown.wall:.2f} s "
+        f"({flown.times_real_time:.0f} times real time); "
+        f"RMS error to the reference {error} m; {_told(settings, told)}"
+    )
+    _tell(report, text, as_json)
+
+
+def _trajectory(name: str, assignments: list[str]) -> Any:
+    from models.reference import trajectory, trajectory_from_csv
+
+    if name.endswith(".csv"):
+        return trajectory_from_csv(_bytes(Path(name)).decode("utf-8", "replace"), name)
+    parameters: dict[str, float | str] = {}
+    for assignment in assignments:
+        key, equals, value = assignment.partition("=")
+        if not equals:
+            raise InputError(f"--parameter {assignment}: write NAME=VALUE")
+        parameters[key] = value
+    return trajectory(name, **parameters)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot read it ({error.strerror})") from None
+
+
+class _Progress:
+    """A bar on standard error for long flights; called with every sample."""
+
+    def __init__(self, ticks: float, quiet: bool) -> None:
+        self._ticks, self._count = ticks, 0
+        self._bar: Any = None
+        # Some 10 000 ticks fly in a second: below that a bar would only flicker.
+        if ticks > 10_000 and not quiet and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import Progress
+
+            self._bar = Progress(console=Console(stderr=True), transient=True)
+
+    def __enter__(self) -> _Progress:
+        if self._bar is not None:
+            self._bar.start()
+            self._task = self._bar.add_task("flying", total=self._ticks)
+        return self
+
+    def __exit__(self, *caught: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, sample: Sample) -> None:
+        self._count += 1
+        if self._bar is not None and self._count % 1000 == 0:
+            self._bar.update(self._task, completed=self._count)
+
+
+@app.command(epilog="Example: sim-bridge reveal hidden.sealed --json")
+def reveal(file: Path, as_json: Json = False) -> None:
+    """Tell what was hidden, from its sealed file."""
+    from sim_bridge.seal import reveal as open_seal
+
+    answer: dict[str, Any] = open_seal(file)
+    lines = []
+    for effect in answer["effects"]:
+        numbers = (
+            f"{key} {entry['value']:.4g} {entry['unit']}" for key, entry in effect["parameters"].items()
+        )
+        lines.append(f"{effect['name']}: " + ", ".join(numbers))
+    _tell(answer, "\n".join(lines) or "nothing was hidden", as_json)
+
+
+@app.command(epilog="Example: sim-bridge pilot --mode POSCTL")
+def pilot(
+    mode: Annotated[
+        str, typer.Option(help="POSCTL, ALTCTL, STABILIZED, HOLD, LAND, RTL, KILL, RELEASE_KILL, ...")
+    ],
+    port: Annotated[
+        int, typer.Option("--pilot-port", help="The pilot's UDP port of `sim-bridge run`.")
+    ] = 14590,
+    as_json: Json = False,
+) -> None:
+    """Take over a running simulation as its pilot: switch the flight mode, or kill."""
+    from sim_bridge.pilot import send_order
+
+    answer = send_order(mode, port)
+    if not answer.get("accepted"):
+        raise InputError(f"--mode {mode}: not taken: {answer.get('reason')}")
+    _tell(answer, f"{answer['mode']}, {'armed' if answer['armed'] else 'disarmed'}", as_json)
+
+
+@app.command(epilog="Example: sim-bridge effects --json")
+def effects(as_json: Json = False) -> None:
+    """List what can be hidden, with the range of its size when it is drawn."""
+    from sim_bridge.truth.hidden import EFFECTS
+
+    rows = [
+        {"name": e.name, "what": e.what, "low": e.low, "high": e.high, "unit": next(iter(e.units.values()))}
+        for e in EFFECTS.values()
+    ]
+    lines = [f"{r['name']:19} {r['low']:g} to {r['high']:g} {r['unit']:6} {r['what']}" for r in rows]
+    _tell({"effects": rows}, "\n".join(lines), as_json)
 
 
 def main() -> None:

@@ -35,9 +35,11 @@ _TICK_EVENT_LEVELS = {"finished": "info", "lost": "error", "crashed": "error"}
 
 @dataclass(frozen=True)
 class Plan:
-    """One flight: who flies what, with what hidden. `rate` of the control law in Hz, `model` an ONNX file's bytes.
+    """One flight: who flies what, with what hidden. `rate` of the control law in Hz, `model` an ONNX file's
+    bytes.
 
-    With a `model` the companion's guard corrects the cascade, as controller `corrected`; otherwise it flies `lqr`.
+    With a `model` the companion's guard corrects the cascade, as controller `corrected`; otherwise it flies
+    `lqr`.
     """
 
     vehicle: Vehicle
@@ -56,7 +58,9 @@ class Plan:
         steps = 1.0 / (self.rate * PHYSICS_STEP)
         if not math.isclose(steps, round(steps), rel_tol=1e-9) or round(steps) < 1:
             physics = round(1 / PHYSICS_STEP)
-            raise InputError(f"--rate {self.rate:g}: must divide the physics rate of {physics} Hz (50, 100, 250, 500)")
+            raise InputError(
+                f"--rate {self.rate:g}: must divide the physics rate of {physics} Hz (50, 100, 250, 500)"
+            )
         return round(steps)
 
 
@@ -92,8 +96,9 @@ class Flown:
 def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     """Fly a plan from hover at the start of its trajectory; `on_sample` is called once a control tick.
 
-    Positions are in the home frame: origin where the vehicle's centre of mass is when it stands on the ground, z
-    up, axes of the world. Raises `InputError` for a design or a model that belongs to another vehicle.
+    Positions are in the home frame: origin where the vehicle's centre of mass is when it stands on the
+    ground, z up, axes of the world. Raises `InputError` for a design or a model that belongs to another
+    vehicle.
     """
     vehicle = plan.vehicle
     law = ControlLaw(vehicle, plan.design)
@@ -169,23 +174,39 @@ def _references(plan: Plan, period: float) -> Iterator[ReferenceSample]:
         offset += leg.duration
 
 
-def record(plan: Plan, path: Path, table: Path | None = None) -> Flown:
-    """Fly a plan into a flight record (MCAP), and into a CSV with the project's column names where asked."""
+def record(
+    plan: Plan, path: Path, table: Path | None = None, on_sample: Callable[[Sample], None] | None = None
+) -> Flown:
+    """Fly a plan into a flight record (MCAP), and into a CSV with the project's column names where asked.
+
+    `on_sample` is called after each tick was taken down. Raises `InputError` where a file cannot be written.
+    """
     expected = plan.repeat * (plan.trajectory.duration + 60.0) * plan.rate
-    metadata = {"created_by": "sim-bridge fly", "trajectory": plan.trajectory.name, "seed": str(plan.seed)}
-    # The writer's thread is slower than the simulation: nothing may be dropped, so all of it has room to wait.
+    metadata = {"created_by": "sim-bridge fly", "trajectory": plan.trajectory.name}
+    # Written after the flight: the recorder's thread would share the interpreter with the simulation and
+    # halve its speed. All of the flight has room in the queue, so that nothing is dropped.
     recorder = FlightRecorder(path, plan.vehicle, plan.design, metadata, queue_limit=int(expected) + 100)
-    tick = _TickWriter(plan, recorder)
+    tick = _TickWriter(plan)
     rows: list[tuple[float, ...]] = []
 
-    def both(sample: Sample) -> None:
-        tick(sample)
-        rows.append(_row(sample))
+    takers: list[Callable[[Sample], None]] = [tick]
+    if table is not None:
+        takers.append(lambda sample: rows.append(_row(sample)))
+    if on_sample is not None:
+        takers.append(on_sample)
+
+    def each(sample: Sample) -> None:
+        for take in takers:
+            take(sample)
 
     try:
-        flown = fly(plan, tick if table is None else both)
+        flown = fly(plan, each if len(takers) > 1 else tick)
+        for message, time_us, host in tick.messages:
+            recorder.tick(message, time_us, host)
         level = _TICK_EVENT_LEVELS[flown.outcome]
-        recorder.event(Event(vehicle_time_us=tick.time_us, level=level, kind=flown.outcome, text=flown.outcome))
+        recorder.event(
+            Event(vehicle_time_us=tick.time_us, level=level, kind=flown.outcome, text=flown.outcome)
+        )
     finally:
         recorder.close(timeout=60.0)
     if recorder.error:
@@ -196,10 +217,12 @@ def record(plan: Plan, path: Path, table: Path | None = None) -> Flown:
 
 
 class _TickWriter:
-    """Turns samples into the protobuf ticks that the companion writes, and enqueues them."""
+    """Turns samples into the protobuf ticks that the companion writes: `messages` with both clocks (us,
+    ns).
+    """
 
-    def __init__(self, plan: Plan, recorder: FlightRecorder) -> None:
-        self._recorder = recorder
+    def __init__(self, plan: Plan) -> None:
+        self.messages: list[tuple[bytes, int, int]] = []
         self._interval = 1.0 / plan.rate
         # What is the same in every tick is set once; each tick then overwrites all the rest.
         self._tick = Tick(
@@ -254,12 +277,18 @@ class _TickWriter:
         tick.guard = sample.guard
         tick.inference = sample.inference
         tick.interval = self._interval
-        self._recorder.tick(tick.SerializeToString(), now.time_us, host)
+        self.messages.append((tick.SerializeToString(), now.time_us, host))
 
 
 _TABLE_COLUMNS = (
     *("position", "velocity", "quaternion", "angular_velocity", "specific_force", "thrust_command"),
-    *("body_rate_command", "battery_voltage", "position_reference", "velocity_reference", "acceleration_reference"),
+    *(
+        "body_rate_command",
+        "battery_voltage",
+        "position_reference",
+        "velocity_reference",
+        "acceleration_reference",
+    ),
     *("yaw_reference", "rotor_speed", "motor_command"),
 )
 

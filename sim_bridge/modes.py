@@ -34,7 +34,9 @@ class Mode(Enum):
 
     @classmethod
     def of(cls, main: int, sub: int) -> Mode | None:
-        """The mode of a main and a sub mode; the sub mode counts in AUTO only. None where there is no such mode."""
+        """The mode of a main and a sub mode; the sub mode counts in AUTO only. None where there is no such
+        mode.
+        """
         for mode in cls:
             if mode.value[0] == main and (main != 4 or mode.value[1] == sub):
                 return mode

@@ -10,7 +10,9 @@ from models.vehicle import Vehicle
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter's default, whose Python type is its type on the wire (int: INT32, float: REAL32), and its limits."""
+    """A parameter's default, whose Python type is its type on the wire (int: INT32, float: REAL32), and its
+    limits.
+    """
 
     default: int | float
     low: float

@@ -1,4 +1,6 @@
-"""Position, velocity and attitude loops of the simulated autopilot, cascaded as PX4's.  World ENU, body FLU."""
+"""Position, velocity and attitude loops of the simulated autopilot, cascaded as PX4's.  World ENU, body
+FLU.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ class RateSetpoint:
 
 @dataclass(frozen=True)
 class AttitudeSetpoint:
-    """Normalised collective thrust, attitude (body to world) and a rate of yaw to feed forward (rad/s, world z)."""
+    """Normalised collective thrust, attitude (body to world) and a rate of yaw to feed forward (rad/s, world
+    z).
+    """
 
     thrust: float
     quaternion: Quaternion
@@ -34,7 +38,9 @@ class AttitudeSetpoint:
 
 @dataclass(frozen=True)
 class MotionSetpoint:
-    """Position (m), velocity (m/s), acceleration (m/s²) in the world and yaw (rad); NaN leaves a number free."""
+    """Position (m), velocity (m/s), acceleration (m/s²) in the world and yaw (rad); NaN leaves a number
+    free.
+    """
 
     position: Vector = FREE
     velocity: Vector = FREE
@@ -59,7 +65,9 @@ def tilt_of(q: Quaternion) -> float:
 
 
 def attitude_of_thrust(force: Vector, yaw: float) -> Quaternion:
-    """The attitude whose body z points along `force` (world) with body x in the vertical plane of `yaw` (rad)."""
+    """The attitude whose body z points along `force` (world) with body x in the vertical plane of `yaw`
+    (rad).
+    """
     length = math.sqrt(sum(f * f for f in force))
     zx, zy, zz = (f / length for f in force)
     # y = z cross heading, x = y cross z; thrust never points sideways enough for z and heading to align.
@@ -123,7 +131,8 @@ class PositionControl:
         force = (wanted[0], wanted[1], up)
         yaw = yaw_now if math.isnan(setpoint.yaw) else setpoint.yaw
         yaw_rate = 0.0 if math.isnan(setpoint.yaw_rate) else setpoint.yaw_rate
-        # The hover thrust is a parameter that the user may set; the vehicle's curve around it is the believed one.
+        # The hover thrust is a parameter that the user may set; the vehicle's curve around it is the believed
+        # one.
         command = self._vehicle.command(self._vehicle.mass * math.sqrt(sum(f * f for f in force)))
         command *= get["MPC_THR_HOVER"] / self._vehicle.hover_thrust
         thrust = min(max(command, get["MPC_THR_MIN"]), get["MPC_THR_MAX"])

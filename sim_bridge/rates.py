@@ -10,17 +10,20 @@ from models.vehicle import GRAVITY, Vehicle
 from sim_bridge.truth.airframe import believed_powertrain
 
 IDLE_SHARE = 0.03
-"""Lowest thrust of a running rotor, as a share of its hover thrust (PX4's PWM_MAIN_MIN keeps rotors turning)."""
+"""Lowest thrust of a running rotor, as a share of its hover thrust (PX4's PWM_MAIN_MIN keeps rotors
+turning).
+"""
 
 _YAW_HEADROOM = 0.15  # of a rotor's range that yaw may take from the collective, as PX4's MINIMUM_YAW_MARGIN
 
 
 class Mixer:
-    """Control allocation with what the owner believes: relative thrust and torque (N m, body FLU) to motor commands.
+    """Control allocation with what the owner believes: relative thrust and torque (N m, body FLU) to motor
+    commands.
 
-    Works in thrust relative to hover, so that a torque never changes the collective, whichever curve the vehicle
-    file assumes between command and thrust. Saturation gives way in PX4's order: yaw first, then the collective,
-    then roll and pitch.
+    Works in thrust relative to hover, so that a torque never changes the collective, whichever curve the
+    vehicle file assumes between command and thrust. Saturation gives way in PX4's order: yaw first, then the
+    collective, then roll and pitch.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -72,7 +75,8 @@ class Mixer:
         # Too much asked: the collective gives way to roll and pitch.
         base = min(base, top - max(tilt))
         if base + min(tilt) < low:
-            # Too little collective for that torque: PX4 without air mode weakens the torque and keeps the thrust.
+            # Too little collective for that torque: PX4 without air mode weakens the torque and keeps the
+            # thrust.
             base = max(base, low)
             room = base - low
             weaker = room / -min(tilt) if min(tilt) < 0 else 1.0
@@ -95,7 +99,9 @@ class Mixer:
 
 
 class RateController:
-    """PID on body rates (rad/s, FLU) to torque (N m), tuned from the vehicle file as its owner would tune it."""
+    """PID on body rates (rad/s, FLU) to torque (N m), tuned from the vehicle file as its owner would tune
+    it.
+    """
 
     def __init__(self, vehicle: Vehicle, dt: float) -> None:
         self.dt = dt
@@ -125,7 +131,9 @@ class RateController:
     def motors(
         self, command: float, p_set: float, q_set: float, r_set: float, p: float, q: float, r: float
     ) -> list[float]:
-        """Motor commands for a normalised collective command and body-rate setpoints, at body rates p, q, r."""
+        """Motor commands for a normalised collective command and body-rate setpoints, at body rates p, q,
+        r.
+        """
         dt = self.dt
         (kp, ki, kd), (kp2, ki2, kd2), (kp3, ki3, _) = self._gains
         smooth = self._smooth

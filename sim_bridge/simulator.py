@@ -6,7 +6,7 @@ import mujoco
 
 from models.vehicle import Vehicle
 from sim_bridge.rates import RateController
-from sim_bridge.truth.airframe import Airframe, believed_powertrain
+from sim_bridge.truth.airframe import believed_powertrain
 from sim_bridge.truth.hidden import Hidden, install
 from sim_bridge.truth.sensors import Estimate, Noise, Sensors
 from sim_bridge.world import PHYSICS_STEP, World
@@ -17,8 +17,8 @@ _STEP_US = round(PHYSICS_STEP * 1e6)
 class Simulator:
     """A vehicle that follows a normalised collective command and body rates (rad/s, FLU).
 
-    The setpoint reaches the inner loop after the powertrain's delay; the inner loop, the rotors and the rigid body
-    advance by 2 ms a step. `time_us` is the vehicle's clock: simulated time.
+    The setpoint reaches the inner loop after the powertrain's delay; the inner loop, the rotors and the rigid
+    body advance by 2 ms a step. `time_us` is the vehicle's clock: simulated time.
     """
 
     def __init__(
@@ -27,10 +27,16 @@ class Simulator:
         self.vehicle = vehicle
         self.world = World(vehicle)
         # Bound once: looking these up in every step would cost as much as the inner loop.
-        self._position, self._velocity, self._wrench = self.world.position, self.world.velocity, self.world.wrench
+        self._position, self._velocity, self._wrench = (
+            self.world.position,
+            self.world.velocity,
+            self.world.wrench,
+        )
         self._mj_step, self._model, self._data = mujoco.mj_step, self.world.model, self.world.data
         self.sensors = Sensors(Noise() if noise is None else noise, seed)
-        powertrain, self.airframe = install(vehicle, hidden, believed_powertrain(vehicle), self.sensors, PHYSICS_STEP)
+        powertrain, self.airframe = install(
+            vehicle, hidden, believed_powertrain(vehicle), self.sensors, PHYSICS_STEP
+        )
         self.rates = RateController(vehicle, PHYSICS_STEP)
         self.time_us = 0
         self.motors = [0.0, 0.0, 0.0, 0.0]
@@ -48,7 +54,9 @@ class Simulator:
         yaw: float = 0.0,
         velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Begin in the air (position m, velocity m/s, world; yaw rad), level, with the rotors at hover speed."""
+        """Begin in the air (position m, velocity m/s, world; yaw rad), level, with the rotors at hover
+        speed.
+        """
         self.world.place(position, yaw, velocity)
         hover = self.vehicle.hover_thrust
         self.airframe.spin(self.airframe.speed_of(hover))
@@ -101,7 +109,11 @@ class Simulator:
             rotation = (m.r00, m.r01, m.r02, m.r10, m.r11, m.r12, m.r20, m.r21, m.r22)
             # Before the first step there is none to take the acceleration from: the vehicle stands or hovers.
             rate = 1.0 / PHYSICS_STEP if self.time_us else 0.0
-            acceleration = ((velocity[0] - m.vx) * rate, (velocity[1] - m.vy) * rate, (velocity[2] - m.vz) * rate)
+            acceleration = (
+                (velocity[0] - m.vx) * rate,
+                (velocity[1] - m.vy) * rate,
+                (velocity[2] - m.vz) * rate,
+            )
             self._estimate = self.sensors.sample(
                 self.time_us, position, velocity, acceleration, rotation, m.voltage, m.speeds
             )

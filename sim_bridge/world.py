@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
+import numpy as np
 
 from models.errors import InputError
 from models.vehicle import GRAVITY, Vehicle
@@ -22,17 +24,23 @@ def check_vehicle(vehicle: Vehicle) -> None:
     where = vehicle.source or vehicle.name
     if len(vehicle.rotor_positions) != 4:
         raise InputError(
-            f"{where}: {len(vehicle.rotor_positions)} rotor_positions; the simulation flies four rotors, give four"
+            f"{where}: {len(vehicle.rotor_positions)} rotor_positions; "
+            "the simulation flies four rotors, give four"
         )
     ixx, iyy, izz = vehicle.inertia
     if min(vehicle.inertia) <= 0:
-        raise InputError(f"{where}: inertia {list(vehicle.inertia)} must be three moments above 0 kg m^2 to simulate")
+        raise InputError(
+            f"{where}: inertia {list(vehicle.inertia)} must be three moments above 0 kg m^2 to simulate"
+        )
     if ixx + iyy < izz or iyy + izz < ixx or izz + ixx < iyy:
         raise InputError(
-            f"{where}: inertia {list(vehicle.inertia)} is no rigid body's (each moment is at most the sum of the others)"
+            f"{where}: inertia {list(vehicle.inertia)} is no rigid body's: "
+            "each moment is at most the sum of the other two"
         )
     if sum(vehicle.rotor_directions) != 0:
-        raise InputError(f"{where}: rotor_directions must be two of each, or the rotors' drag torques do not cancel")
+        raise InputError(
+            f"{where}: rotor_directions must be two of each, or the rotors' drag torques do not cancel"
+        )
 
 
 def leg_length(vehicle: Vehicle) -> float:
@@ -43,7 +51,9 @@ def leg_length(vehicle: Vehicle) -> float:
 
 
 def model_xml(vehicle: Vehicle) -> str:
-    """The MJCF of a vehicle: one free body with its believed mass and inertia, four feet, and a ground plane."""
+    """The MJCF of a vehicle: one free body with its believed mass and inertia, four feet, and a ground
+    plane.
+    """
     arm = max(math.hypot(x, y) for x, y, _ in vehicle.rotor_positions)
     foot = _FOOT_RADIUS_PER_ARM * arm
     leg = leg_length(vehicle)
@@ -56,7 +66,7 @@ def model_xml(vehicle: Vehicle) -> str:
     # A contact's damping must not push a light vehicle off the ground: one step's time constant is too stiff,
     # ten steps (20 ms) keep the legs' spring well below the physics rate.
     return f"""<mujoco model="{vehicle.name}">
-  <option timestep="{PHYSICS_STEP}" integrator="Euler" gravity="0 0 {-GRAVITY}" cone="elliptic" density="0" viscosity="0"/>
+  <option timestep="{PHYSICS_STEP}" integrator="Euler" gravity="0 0 {-GRAVITY}" cone="elliptic"/>
   <default><geom friction="0.9 0.005 0.0001" solref="0.02 1"/></default>
   <worldbody>
     <geom name="ground" type="plane" size="{ARENA} {ARENA} 1"/>
@@ -71,12 +81,17 @@ def model_xml(vehicle: Vehicle) -> str:
 """
 
 
+def _floats(array: np.ndarray) -> Any:
+    """A view of an array that gives and takes plain floats, faster than numpy's own scalars."""
+    return memoryview(array)  # type: ignore[arg-type]
+
+
 class World:
     """MuJoCo's model and data of one vehicle, with the arrays bound once.
 
-    `position` holds x, y, z (m, world) and the quaternion w, x, y, z; `velocity` holds the linear velocity (m/s,
-    world) and the body rates (rad/s, body); `wrench` is the force (N, world) and torque (N m, body) for the next
-    step. All three are views of MuJoCo's memory.
+    `position` holds x, y, z (m, world) and the quaternion w, x, y, z; `velocity` holds the linear velocity
+    (m/s, world) and the body rates (rad/s, body); `wrench` is the force (N, world) and torque (N m, body) for
+    the next step. All three are views of MuJoCo's memory.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -84,10 +99,10 @@ class World:
         self.model = mujoco.MjModel.from_xml_string(model_xml(vehicle))
         self.data = mujoco.MjData(self.model)
         self.standing_height = leg_length(vehicle)
-        self.position = memoryview(self.data.qpos)
-        self.velocity = memoryview(self.data.qvel)
+        self.position = _floats(self.data.qpos)
+        self.velocity = _floats(self.data.qvel)
         # A free joint's generalised force is the force in the world and the torque in the body.
-        self.wrench = memoryview(self.data.qfrc_applied)
+        self.wrench = _floats(self.data.qfrc_applied)
         mujoco.mj_forward(self.model, self.data)
 
     def step(self) -> None:
@@ -116,4 +131,8 @@ class World:
         moments = self.model.body_inertia[1]
         vx, vy, vz, p, q, r = self.velocity.tolist()
         turning = moments[0] * p * p + moments[1] * q * q + moments[2] * r * r
-        return 0.5 * mass * (vx * vx + vy * vy + vz * vz) + 0.5 * float(turning) + mass * GRAVITY * self.position[2]
+        return (
+            0.5 * mass * (vx * vx + vy * vy + vz * vz)
+            + 0.5 * float(turning)
+            + mass * GRAVITY * self.position[2]
+        )

@@ -94,7 +94,10 @@ class Commands:
 
     def _set_position_target_global(self, message: Any, peer: Peer) -> Reply:
         altitude = message.alt
-        if message.coordinate_frame in (mav.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, mav.MAV_FRAME_GLOBAL_RELATIVE_ALT):
+        if message.coordinate_frame in (
+            mav.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+            mav.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+        ):
             altitude += wire.ORIGIN[2] + self.autopilot.home[2]
         elif message.coordinate_frame not in (mav.MAV_FRAME_GLOBAL_INT, mav.MAV_FRAME_GLOBAL):
             return ()
@@ -119,7 +122,9 @@ class Commands:
         yaw = _NAN if mask & mav.POSITION_TARGET_TYPEMASK_YAW_IGNORE else wire.heading(message.yaw)
         yaw_rate = _NAN if mask & mav.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE else -message.yaw_rate
         self.autopilot.offboard(
-            MotionSetpoint(unmasked(position, 0), unmasked(velocity, 3), unmasked(acceleration, 6), yaw, yaw_rate)
+            MotionSetpoint(
+                unmasked(position, 0), unmasked(velocity, 3), unmasked(acceleration, 6), yaw, yaw_rate
+            )
         )
 
     # Commands

@@ -1,6 +1,7 @@
 """ESC_STATUS (message 291), which PX4 sends and MAVSDK reads but pymavlink's common dialect leaves out.
 
-Source: the message's definition in MAVLink's common.xml; the field order on the wire and the CRC seed follow from it.
+Source: the message's definition in MAVLink's common.xml; the field order on the wire and the CRC seed follow
+from it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pymavlink.dialects.v20 import common as mav
 ESC_STATUS = 291
 
 
-class EscStatus(mav.MAVLink_message):  # type: ignore[misc]
+class EscStatus(mav.MAVLink_message):
     """Rotor speeds (rpm), voltages (V) and currents (A) of four ESCs, the first having the given index."""
 
     id = ESC_STATUS
@@ -35,7 +36,12 @@ class EscStatus(mav.MAVLink_message):  # type: ignore[misc]
     instance_offset = 56
 
     def __init__(
-        self, index: int, time_usec: int, rpm: Sequence[int], voltage: Sequence[float], current: Sequence[float]
+        self,
+        index: int,
+        time_usec: int,
+        rpm: Sequence[int],
+        voltage: Sequence[float],
+        current: Sequence[float],
     ) -> None:
         mav.MAVLink_message.__init__(self, self.id, self.msgname)
         self._fieldnames = self.fieldnames

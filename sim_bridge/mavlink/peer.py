@@ -47,7 +47,9 @@ class Peer:
         return packed
 
     def set_interval(self, number: int, interval: float, now: int) -> bool:
-        """As MAV_CMD_SET_MESSAGE_INTERVAL: us between messages, 0 the default rate, -1 off. False where unknown."""
+        """As MAV_CMD_SET_MESSAGE_INTERVAL: us between messages, 0 the default rate, -1 off. False where
+        unknown.
+        """
         if number not in self.streams or not math.isfinite(interval):
             return False
         stream = self.streams[number]

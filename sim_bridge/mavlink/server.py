@@ -26,7 +26,18 @@ _FORGET_US = 10_000_000  # a partner that connected by itself is forgotten after
 _STATUS_TEXT = 50  # bytes a STATUSTEXT carries; longer texts come in pieces
 _SOCKET_BUFFER = 1 << 20
 
-PILOT_MODES = ("POSCTL", "ALTCTL", "STABILIZED", "MANUAL", "HOLD", "LAND", "RTL", "OFFBOARD", "KILL", "RELEASE_KILL")
+PILOT_MODES = (
+    "POSCTL",
+    "ALTCTL",
+    "STABILIZED",
+    "MANUAL",
+    "HOLD",
+    "LAND",
+    "RTL",
+    "OFFBOARD",
+    "KILL",
+    "RELEASE_KILL",
+)
 """What the simulated pilot can switch to."""
 
 
@@ -69,7 +80,9 @@ def _bind(address: Address, what: str, option: str) -> socket.socket:
                 f"UDP port {port} on {host} is in use ({what}): another sim-bridge or PX4 may be running; "
                 f"stop it or choose another port with {option}"
             ) from None
-        raise InputError(f"cannot use {host}:{port} for {what}: {error.strerror}; choose another with {option}") from None
+        raise InputError(
+            f"cannot use {host}:{port} for {what}: {error.strerror}; choose another with {option}"
+        ) from None
     bound.setblocking(False)
     return bound
 
@@ -112,8 +125,8 @@ class Server:
         due = time.perf_counter()
         while running():
             wait = due - time.perf_counter()
-            # select sleeps to within some 0.1 ms and wakes at once for a datagram, so that a setpoint acts in the
-            # physics step that follows its arrival.
+            # select sleeps to within some 0.1 ms and wakes at once for a datagram, so that a setpoint acts in
+            # the physics step that follows its arrival.
             ready, _, _ = select.select(sockets, (), (), max(wait, 0.0))
             if ready:
                 self._receive(ready)
@@ -190,7 +203,8 @@ class Server:
             for sequence, piece in enumerate(pieces):
                 number = self._notice_id if len(pieces) > 1 else 0
                 message = mav.MAVLink_statustext_message(severity, piece, number, sequence)
-                # PX4 tells ground stations only: a companion learns of a refusal from the acknowledgement alone.
+                # PX4 tells ground stations only: a companion learns of a refusal from the acknowledgement
+                # alone.
                 for peer in self.peers.values():
                     if peer.ground_station:
                         self._send(peer, message)

@@ -1,4 +1,6 @@
-"""Every message that the simulated vehicle sends in streams: contents, and PX4's default rates on an onboard link."""
+"""Every message that the simulated vehicle sends in streams: contents, and PX4's default rates on an onboard
+link.
+"""
 
 from __future__ import annotations
 
@@ -167,7 +169,9 @@ def _attitude_target(a: Autopilot) -> Any:
 
 def _local_position(a: Autopilot) -> Any:
     e = a.simulator.estimate()
-    return mav.MAVLink_local_position_ned_message(e.time_us // 1000, *wire.ned(e.position), *wire.ned(e.velocity))
+    return mav.MAVLink_local_position_ned_message(
+        e.time_us // 1000, *wire.ned(e.position), *wire.ned(e.velocity)
+    )
 
 
 def _global_position(a: Autopilot) -> Any:
@@ -249,9 +253,7 @@ def _esc_status(a: Autopilot) -> Any:
     e = a.simulator.estimate()
     battery = a.simulator.airframe.battery
     turns = [round(speed * 60 / (2 * math.pi)) for speed in e.rotor_speed]
-    return EscStatus(
-        0, e.time_us, turns, [e.battery_voltage] * 4, [battery.current / 4] * 4
-    )
+    return EscStatus(0, e.time_us, turns, [e.battery_voltage] * 4, [battery.current / 4] * 4)
 
 
 def _servo_output(a: Autopilot) -> Any:
@@ -270,7 +272,8 @@ def _autopilot_version(a: Autopilot) -> Any:
 
 
 STREAMS: dict[int, tuple[Build, float]] = {
-    # Sent in this order when due together: a companion that acts on the odometry has the IMU of the same moment.
+    # Sent in this order when due together: a companion that acts on the odometry has the IMU of the same
+    # moment.
     mav.MAVLINK_MSG_ID_HIGHRES_IMU: (_highres_imu, 50.0),
     mav.MAVLINK_MSG_ID_ODOMETRY: (_odometry, 30.0),
     mav.MAVLINK_MSG_ID_HEARTBEAT: (_heartbeat, 1.0),
@@ -303,4 +306,3 @@ ESTIMATOR_STREAMS = frozenset(
     }
 )
 """Messages that come no faster than the estimator runs (EKF2_PREDICT_US)."""
-

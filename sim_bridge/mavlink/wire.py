@@ -1,4 +1,6 @@
-"""Frames and units at the rim: world ENU and body FLU inside, NED, FRD, degrees and milli-units on the wire."""
+"""Frames and units at the rim: world ENU and body FLU inside, NED, FRD, degrees and milli-units on the
+wire.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ EARTH_RADIUS = 6371000.0
 """m; PX4's map projection uses a sphere of this radius."""
 
 ORIGIN = (47.397742, 8.545594, 488.0)
-"""Latitude and longitude in degrees and altitude in m of the local origin: PX4's usual simulation home in Zurich."""
+"""Latitude and longitude in degrees and altitude in m of the local origin: PX4's usual simulation home in
+Zurich.
+"""
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

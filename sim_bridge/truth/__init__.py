@@ -1,1 +1,3 @@
-"""The simulator's own truth: rotors, battery, air and sensors, written independently of the models that fit it."""
+"""The simulator's own truth: rotors, battery, air and sensors, written independently of the models that fit
+it.
+"""

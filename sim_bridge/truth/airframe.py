@@ -1,8 +1,8 @@
 """Rotors on a frame in air: from motor commands and motion to the force and torque on the body.
 
-Nominally it does what the owner of the vehicle believes: thrust follows the believed curve of the command through
-the believed first-order lag of rotor speed, whatever the battery does, and the air does nothing. Hidden effects
-change its numbers or act in `on_rotors` and `on_body`.
+Nominally it does what the owner of the vehicle believes: thrust follows the believed curve of the command
+through the believed first-order lag of rotor speed, whatever the battery does, and the air does nothing.
+Hidden effects change its numbers or act in `on_rotors` and `on_body`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ _DISCHARGE_STEPS = 5  # the state of charge moves in minutes; it need not be int
 
 @dataclass(frozen=True)
 class Powertrain:
-    """The numbers of the rotors and of what drives them. Rotors in the order of the vehicle's rotor_positions.
+    """The numbers of the rotors and of what drives them. Rotors in the order of the vehicle's
+    rotor_positions.
 
-    `thrust_constants` in N s² (thrust over rotor speed squared), `torque_per_thrust` in m, `hover_speed` in rad/s.
-    `speed_blend` is the share of the other curve in the map from command to rotor speed (0: as believed).
-    `time_constant` of rotor speed and `delay` from setpoint to motors in s.
+    `thrust_constants` in N s² (thrust over rotor speed squared), `torque_per_thrust` in m, `hover_speed` in
+    rad/s. `speed_blend` is the share of the other curve in the map from command to rotor speed (0: as
+    believed). `time_constant` of rotor speed and `delay` from setpoint to motors in s.
     """
 
     thrust_constants: tuple[float, float, float, float]
@@ -70,9 +71,9 @@ def believed_powertrain(vehicle: Vehicle) -> Powertrain:
 class Motion:
     """What the air and the rotors meet, one step at a time; every number a plain float.
 
-    `x, y, z` m in the world; `r00..r22` the rotation body to world; `vx, vy, vz` m/s in the world; `u, v, w` the
-    velocity through the air in the body, m/s; `p, q, r` body rates, rad/s; `speeds` rad/s and `thrusts` N of the
-    rotors; `wrench` the force (N) and torque (N m) in the body; `voltage` at the battery.
+    `x, y, z` m in the world; `r00..r22` the rotation body to world; `vx, vy, vz` m/s in the world; `u, v, w`
+    the velocity through the air in the body, m/s; `p, q, r` body rates, rad/s; `speeds` rad/s and `thrusts` N
+    of the rotors; `wrench` the force (N) and torque (N m) in the body; `voltage` at the battery.
     """
 
     __slots__ = (
@@ -98,8 +99,8 @@ Act = Callable[[Motion], None]
 class Airframe:
     """The vehicle's rotors in air.
 
-    `on_rotors` are called after the rotors' speeds are known and may change `motion.thrusts`; `on_body` are called
-    last and add to `motion.wrench`. `wind` is the air's velocity in the world, m/s.
+    `on_rotors` are called after the rotors' speeds are known and may change `motion.thrusts`; `on_body` are
+    called last and add to `motion.wrench`. `wind` is the air's velocity in the world, m/s.
     """
 
     def __init__(self, vehicle: Vehicle, powertrain: Powertrain, dt: float) -> None:
@@ -135,11 +136,14 @@ class Airframe:
         """Set all rotors to a speed (rad/s), to start a simulation in the air."""
         self.motion.speeds[:] = (speed,) * 4
 
-    def act(self, position: list[float], velocity: list[float], commands: list[float], wrench: memoryview) -> None:
-        """Advance the rotors by one step and write force (world) and torque (body) of that step into `wrench`.
+    def act(
+        self, position: list[float], velocity: list[float], commands: list[float], wrench: memoryview[float]
+    ) -> None:
+        """Advance the rotors by one step and write force (world) and torque (body) of that step into
+        `wrench`.
 
-        `position` (x, y, z, quaternion) and `velocity` (linear, angular) are those of `World`; `commands` the four
-        motor commands, 0 to 1.
+        `position` (x, y, z, quaternion) and `velocity` (linear, angular) are those of `World`; `commands` the
+        four motor commands, 0 to 1.
         """
         m = self.motion
         m.x, m.y, m.z, qw, qx, qy, qz = position
@@ -162,9 +166,8 @@ class Airframe:
         linear, follow = train.linear, self._follow
         speeds, thrusts = m.speeds, m.thrusts
         power = 0.0
-        i = 0
-        for command in commands:
-            ratio = command / hover_command
+        for i in (0, 1, 2, 3):
+            ratio = commands[i] / hover_command
             if linear:
                 target = sqrt(ratio)
                 if blend:
@@ -178,7 +181,6 @@ class Airframe:
             middle = before + 0.5 * change
             thrusts[i] = thrust = constants[i] * middle * middle
             power += thrust * middle
-            i += 1
         m.voltage = self.battery.load(power * self._power_per_speed + _AVIONICS_POWER)
         self._steps += 1
         if self._steps % _DISCHARGE_STEPS == 0:
@@ -194,7 +196,8 @@ class Airframe:
         body[2] = t0 + t1 + t2 + t3
         body[3] = y0 * t0 + y1 * t1 + y2 * t2 + y3 * t3
         body[4] = -(x0 * t0 + x1 * t1 + x2 * t2 + x3 * t3)
-        # A rotor that turns counter-clockwise is braked clockwise by the air, and so is the body that holds it.
+        # A rotor that turns counter-clockwise is braked clockwise by the air, and so is the body that holds
+        # it.
         body[5] = -(c0 * t0 + c1 * t1 + c2 * t2 + c3 * t3)
         for act in self.on_body:
             act(m)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from models.vehicle import Vehicle
 
-# Rest voltage of one lithium-polymer cell over its state of charge, a typical curve (Plett, "Battery Management
-# Systems I", 2015, section 2.2, shows the shape).
+# Rest voltage of one lithium-polymer cell over its state of charge, a typical curve (Plett, "Battery
+# Management Systems I", 2015, section 2.2, shows the shape).
 _CHARGE = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 _CELL = (3.20, 3.52, 3.63, 3.71, 3.75, 3.79, 3.84, 3.90, 3.97, 4.05, 4.13, 4.20)
 _CELL_NOMINAL = 4.0
@@ -27,8 +27,12 @@ class BatteryCell:
     charge: float
 
 
-def battery_for(vehicle: Vehicle, hover_power: float, endurance: float = 480.0, charge: float = 0.97) -> BatteryCell:
-    """A battery that suits the vehicle: `endurance` s of hover at `hover_power` W, sagging 4 % under that load."""
+def battery_for(
+    vehicle: Vehicle, hover_power: float, endurance: float = 480.0, charge: float = 0.97
+) -> BatteryCell:
+    """A battery that suits the vehicle: `endurance` s of hover at `hover_power` W, sagging 4 % under that
+    load.
+    """
     current = hover_power / vehicle.nominal_voltage
     resistance = 0.04 * vehicle.nominal_voltage / current
     return BatteryCell(
@@ -64,7 +68,8 @@ class Battery:
         """Terminal voltage, V, when the consumers draw `power` W now."""
         source = self._source - self._polarisation
         resistance = self.cell.resistance
-        # P = V (E - V) / R; the higher root, and half the source's voltage where the battery cannot give that power.
+        # P = V (E - V) / R; the higher root, and half the source's voltage where the battery cannot give that
+        # power.
         discriminant = source * source - 4.0 * resistance * power
         self.voltage = 0.5 * (source + discriminant**0.5) if discriminant > 0.0 else 0.5 * source
         self.current = (source - self.voltage) / resistance

@@ -1,7 +1,8 @@
 """Physical effects that the simulator can hide, one small class each, by the project's standard names.
 
-The formulas are the simulator's own: per rotor, in forces and rotor speeds. Add an effect by writing a class with
-`@register`; it may change the powertrain's numbers, act on the rotors, act on the body, or bias the sensors.
+The formulas are the simulator's own: per rotor, in forces and rotor speeds. Add an effect by writing a class
+with `@register`; it may change the powertrain's numbers, act on the rotors, act on the body, or bias the
+sensors.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import difflib
 import math
 import random
 from dataclasses import dataclass, replace
+from math import sqrt
+from typing import ClassVar
 
 from models.errors import InputError
 from models.vehicle import GRAVITY, Vehicle
@@ -29,7 +32,9 @@ class Hidden:
         units = EFFECTS[self.name].units
         return {
             "name": self.name,
-            "parameters": {key: {"value": value, "unit": units[key]} for key, value in self.parameters.items()},
+            "parameters": {
+                key: {"value": value, "unit": units[key]} for key, value in self.parameters.items()
+            },
         }
 
 
@@ -43,7 +48,7 @@ class Effect:
     what: str
     low: float
     high: float
-    units: dict[str, str]
+    units: ClassVar[dict[str, str]]
     least: float = 0.0
     most: float = math.inf
 
@@ -56,8 +61,12 @@ class Effect:
         """The powertrain with this effect."""
         return train
 
-    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
-        """Let the effect act on rotors, body or sensors; `others` are the names of all that is hidden with it."""
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """Let the effect act on rotors, body or sensors; `others` are the names of all that is hidden with
+        it.
+        """
 
 
 EFFECTS: dict[str, Effect] = {}
@@ -75,7 +84,7 @@ class ThrustGain(Effect):
 
     name, what = "thrust_gain", "thrust of every rotor is off by a factor"
     low, high, least, most = 0.80, 1.20, 0.5, 2.0
-    units = {"gain": "1"}
+    units: ClassVar = {"gain": "1"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """Off by 7 to 20 %, up or down; nothing is hidden in a gain of one."""
@@ -95,7 +104,7 @@ class ThrustCurve(Effect):
 
     name, what = "thrust_curve", "the map from command to rotor speed is another curve, right at hover only"
     low, high, least, most = 0.35, 0.9, -0.5, 1.5
-    units = {"speed_blend": "1"}
+    units: ClassVar = {"speed_blend": "1"}
 
     def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
         """Rotor speed becomes a blend of the square-root and the proportional map."""
@@ -108,9 +117,11 @@ class BatterySag(Effect):
 
     name, what = "battery_sag", "thrust follows a power of the battery's voltage over the nominal one"
     low, high, least, most = 0.9, 2.0, -4.0, 4.0
-    units = {"exponent": "1"}
+    units: ClassVar = {"exponent": "1"}
 
-    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
         """All thrusts times (V / V_nominal) to the exponent."""
         nominal, exponent = airframe.vehicle.nominal_voltage, numbers["exponent"]
 
@@ -129,7 +140,7 @@ class MotorLag(Effect):
 
     name, what = "motor_lag", "the rotors' speed lags its command with another time constant"
     low, high, least, most = 0.045, 0.080, 0.0, 1.0
-    units = {"time_constant": "s"}
+    units: ClassVar = {"time_constant": "s"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """At least 25 ms above the believed one, else it would not be hidden but absent."""
@@ -148,7 +159,7 @@ class TransportDelay(Effect):
 
     name, what = "transport_delay", "setpoints reach the motors later than believed, by this much more"
     low, high, least, most = 0.020, 0.045, 0.0, 0.5
-    units = {"extra_delay": "s"}
+    units: ClassVar = {"extra_delay": "s"}
 
     def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
         """The believed delay plus the hidden one."""
@@ -157,15 +168,19 @@ class TransportDelay(Effect):
 
 @register
 class RotorDrag(Effect):
-    """H-force of each rotor, proportional to its speed and to the air's velocity at its hub, in the rotor plane.
+    """H-force of each rotor, proportional to its speed and to the air's velocity at its hub, in the rotor
+    plane.
 
-    Source: Martin and Salaün, "The true role of accelerometer feedback in quadrotor control", ICRA 2010; Faessler
-    et al., "Differential flatness of quadrotor dynamics subject to rotor drag", RA-L 2018.
+    Source: Martin and Salaün, "The true role of accelerometer feedback in quadrotor control", ICRA 2010;
+    Faessler et al., "Differential flatness of quadrotor dynamics subject to rotor drag", RA-L 2018.
     """
 
-    name, what = "rotor_drag", "each rotor drags in its plane, in proportion to its speed and the air's velocity there"
+    name, what = (
+        "rotor_drag",
+        "each rotor drags in its plane, in proportion to its speed and the air's velocity there",
+    )
     low, high, most = 0.15, 0.45, 5.0
-    units = {"x": "1/s", "y": "1/s"}
+    units: ClassVar = {"x": "1/s", "y": "1/s"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """Acceleration per speed at hover along body x, and up to 25 % more along y."""
@@ -174,7 +189,9 @@ class RotorDrag(Effect):
         x = x if size is None else size
         return {"x": x, "y": ratio * x}
 
-    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
         """Force -c omega_i V_i at every hub, V_i with the velocity that the body's rates give the hub."""
         airframe.on_body.append(rotor_drag(airframe, numbers["x"], numbers["y"]))
 
@@ -215,7 +232,7 @@ class ParasiticDrag(Effect):
 
     name, what = "parasitic_drag", "the frame drags with the square of the air's velocity"
     low, high, most = 0.05, 0.14, 5.0
-    units = {"x": "1/m", "y": "1/m", "z": "1/m"}
+    units: ClassVar = {"x": "1/m", "y": "1/m", "z": "1/m"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """Acceleration per speed squared along body x; y and z have larger areas."""
@@ -224,7 +241,9 @@ class ParasiticDrag(Effect):
         x = x if size is None else size
         return {"x": x, "y": y_ratio * x, "z": z_ratio * x}
 
-    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
         """Force -0.5 rho (C_D A)_axis |V| V_axis at the centre of mass."""
         areas = [2.0 * airframe.vehicle.mass * numbers[axis] / AIR_DENSITY for axis in "xyz"]
         ax, ay, az = (0.5 * AIR_DENSITY * area for area in areas)
@@ -242,54 +261,71 @@ class ParasiticDrag(Effect):
 
 @register
 class GroundEffect(Effect):
-    """Each rotor feels the images of all four below the ground, at the heights that the attitude gives their hubs.
+    """Each rotor feels the images of all four below the ground, at the heights that the attitude gives their
+    hubs.
 
-    Method of images: Cheeseman and Bennett, ARC R&M 3021, 1955, for the rotor's own image; Sanchez-Cuenca et al.,
-    "Characterization of the aerodynamic ground effect and its influence in multirotor control", 2017, for those of
-    its neighbours. The effective radius is larger than the propeller's, as measured on small quadrotors.
+    Method of images: Cheeseman and Bennett, ARC R&M 3021, 1955, for the rotor's own image; Sanchez-Cuenca et
+    al., "Characterization of the aerodynamic ground effect and its influence in multirotor control", 2017,
+    for those of its neighbours. The effective radius is larger than the propeller's, as measured on small
+    quadrotors.
     """
 
     name, what = "ground_effect", "each rotor's thrust rises near the ground, by the images of all four"
     low, high, most = 2.0, 3.2, 6.0
-    units = {"radius_factor": "1"}
+    units: ClassVar = {"radius_factor": "1"}
 
-    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
-        """Thrust of rotor i over 1 - sum_j (R²/2) h / (d_ij² + 4 h²)^(3/2), h the mean height of hubs i and j."""
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """Thrust of rotor i over 1 - sum_j (R²/2) h / (d_ij² + 4 h²)^(3/2), h the mean height of hubs i and
+        j.
+        """
         hubs = tuple(airframe.vehicle.rotor_positions)
         radius = numbers["radius_factor"] * airframe.vehicle.rotor_radius
         half_square = 0.5 * radius * radius
-        # Below a quarter of the radius the images leave their range of validity; the feet are longer than that.
+        # Below a quarter of the radius the images leave their range of validity; the feet are longer than
+        # that.
         least, ceiling = 0.25 * radius, 20.0 * radius
-        apart = tuple(
-            tuple((xi - xj) ** 2 + (yi - yj) ** 2 for xj, yj, _ in hubs) for xi, yi, _ in hubs
+        # Rotor i feels the image of j as j feels that of i: six pairs and four images of their own.
+        pairs = tuple(
+            (i, j, (hubs[i][0] - hubs[j][0]) ** 2 + (hubs[i][1] - hubs[j][1]) ** 2)
+            for i in range(4)
+            for j in range(i)
         )
 
         def act(m: Motion) -> None:
-            z = m.z
+            z, r20, r21, r22 = m.z, m.r20, m.r21, m.r22
             if z > ceiling:
                 return
-            heights = [max(z + m.r20 * hx + m.r21 * hy + m.r22 * hz, least) for hx, hy, hz in hubs]
+            heights = [0.0, 0.0, 0.0, 0.0]
+            images = [0.0, 0.0, 0.0, 0.0]
+            for i, (x, y, up) in enumerate(hubs):
+                h = z + r20 * x + r21 * y + r22 * up
+                heights[i] = h = h if h > least else least
+                images[i] = 0.125 / (h * h)
+            for i, j, apart in pairs:
+                h = 0.5 * (heights[i] + heights[j])
+                square = apart + 4.0 * h * h
+                image = h / (square * sqrt(square))
+                images[i] += image
+                images[j] += image
             thrusts = m.thrusts
-            gains = []
             for i in (0, 1, 2, 3):
-                row, own, total = apart[i], heights[i], 0.0
-                for j in (0, 1, 2, 3):
-                    h = 0.5 * (own + heights[j])
-                    total += h / (row[j] + 4.0 * h * h) ** 1.5
-                gains.append(1.0 / (1.0 - min(half_square * total, 0.5)))
-            for i in (0, 1, 2, 3):
-                thrusts[i] *= gains[i]
+                loss = half_square * images[i]
+                thrusts[i] /= 1.0 - (loss if loss < 0.5 else 0.5)
 
         airframe.on_rotors.append(act)
 
 
 @register
 class Wind(Effect):
-    """Steady wind. It acts through drag: where no drag is hidden with it, the rotors drag as known for such frames."""
+    """Steady wind. It acts through drag: where no drag is hidden with it, the rotors drag as known for such
+    frames.
+    """
 
     name, what = "wind", "a steady horizontal wind, acting through rotor drag"
     low, high, most = 3.0, 5.5, 15.0
-    units = {"speed": "m/s", "east": "m/s", "north": "m/s", "drag": "1/s"}
+    units: ClassVar = {"speed": "m/s", "east": "m/s", "north": "m/s", "drag": "1/s"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """A speed (m/s) from any direction."""
@@ -298,7 +334,9 @@ class Wind(Effect):
         east, north = speed * math.cos(direction), speed * math.sin(direction)
         return {"speed": speed, "east": east, "north": north, "drag": generator.uniform(0.18, 0.28)}
 
-    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
         """Move the air; bring rotor drag along if nothing else drags."""
         airframe.wind = (numbers["east"], numbers["north"], 0.0)
         if not others & {"rotor_drag", "parasitic_drag"}:
@@ -311,7 +349,7 @@ class AccelerometerBias(Effect):
 
     name, what = "accelerometer_bias", "the accelerometer reads a constant off, in body axes"
     low, high, most = 0.2, 0.5, 0.3 * GRAVITY
-    units = {"size": "m/s^2", "x": "m/s^2", "y": "m/s^2", "z": "m/s^2"}
+    units: ClassVar = {"size": "m/s^2", "x": "m/s^2", "y": "m/s^2", "z": "m/s^2"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """A size (m/s²) in any direction."""
@@ -322,7 +360,9 @@ class AccelerometerBias(Effect):
         x, y, z = (size * component / length for component in axis)
         return {"size": size, "x": x, "y": y, "z": z}
 
-    def attach(self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]) -> None:
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
         """Added to every reading."""
         sensors.accelerometer_bias = (numbers["x"], numbers["y"], numbers["z"])
 
@@ -355,10 +395,14 @@ def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> 
             try:
                 size = float(text)
             except ValueError:
-                raise InputError(f"--hidden {request}: '{text}' is not a number; write NAME or NAME:SIZE") from None
+                raise InputError(
+                    f"--hidden {request}: '{text}' is not a number; write NAME or NAME:SIZE"
+                ) from None
             if not effect.least <= size <= effect.most:
                 unit = next(iter(effect.units.values()))
-                raise InputError(f"--hidden {request}: size must be {effect.least:g} to {effect.most:g} {unit}")
+                raise InputError(
+                    f"--hidden {request}: size must be {effect.least:g} to {effect.most:g} {unit}"
+                )
         chosen[name] = _make(name, size, vehicle, seed)
     return tuple(chosen.values())
 

@@ -14,8 +14,8 @@ from models.vehicle import GRAVITY
 class Estimate(NamedTuple):
     """The vehicle's own view of itself at one moment. World ENU, body FLU, SI units.
 
-    `time_us` is the vehicle's clock. `specific_force` is the accelerometer's. `rotor_speed` in rad/s, as the ESCs
-    report it.
+    `time_us` is the vehicle's clock. `specific_force` is the accelerometer's. `rotor_speed` in rad/s, as the
+    ESCs report it.
     """
 
     time_us: int
@@ -30,10 +30,11 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations: white noise of each sample, and slow wander of the estimator with its time constant (s).
+    """Standard deviations: white noise of each sample, and slow wander of the estimator with its time
+    constant (s).
 
-    The figures are those of a good small autopilot after its filters: accelerometer and gyroscope after the 30 Hz
-    low-pass and averaging, position and velocity of an estimator with motion capture or RTK.
+    The figures are those of a good small autopilot after its filters: accelerometer and gyroscope after the
+    30 Hz low-pass and averaging, position and velocity of an estimator with motion capture or RTK.
     """
 
     accelerometer: float = 0.08  # m/s²
@@ -54,7 +55,9 @@ _BLOCK, _DRAWS = 1024, 25
 
 
 class Sensors:
-    """Draws every sample's errors from one seeded generator; `accelerometer_bias` (m/s², body) is a hidden effect."""
+    """Draws every sample's errors from one seeded generator; `accelerometer_bias` (m/s², body) is a hidden
+    effect.
+    """
 
     def __init__(self, noise: Noise, seed: int) -> None:
         self.noise = noise
@@ -74,10 +77,11 @@ class Sensors:
         voltage: float,
         speeds: list[float],
     ) -> Estimate:
-        """One sample. `position` is x, y, z, quaternion and `velocity` linear (world) and angular (body), as in `World`.
+        """One sample. `position` is x, y, z, quaternion and `velocity` linear (world) and angular (body), as
+        in `World`.
 
-        `acceleration` (world, m/s²) and `rotation` (nine numbers, body to world) belong to the step that has just
-        been made, so that the specific force is the one that acted in it.
+        `acceleration` (world, m/s²) and `rotation` (nine numbers, body to world) belong to the step that has
+        just been made, so that the specific force is the one that acted in it.
         """
         if not self._rows:
             # Drawn in blocks: one call for a thousand samples costs less than one call for each number.
@@ -109,8 +113,16 @@ class Sensors:
         sa, sg = noise.accelerometer, noise.gyroscope
         return Estimate(
             time_us,
-            (x + sp * n[9] + sw * wander[0], y + sp * n[10] + sw * wander[1], z + sp * n[11] + sw * wander[2]),
-            (vx + vp * n[12] + vw * wander[3], vy + vp * n[13] + vw * wander[4], vz + vp * n[14] + vw * wander[5]),
+            (
+                x + sp * n[9] + sw * wander[0],
+                y + sp * n[10] + sw * wander[1],
+                z + sp * n[11] + sw * wander[2],
+            ),
+            (
+                vx + vp * n[12] + vw * wander[3],
+                vy + vp * n[13] + vw * wander[4],
+                vz + vp * n[14] + vw * wander[5],
+            ),
             (scale * ew, scale * fx, scale * fy, scale * fz),
             (p + sg * n[18], q + sg * n[19], r + sg * n[20]),
             (
