@@ -194,6 +194,9 @@ def fly(
     from models.design import load_design
     from sim_bridge.in_process import Plan, record
 
+    if output.exists():
+        # Before the answer is sealed: the one beside an older record must not be lost.
+        raise InputError(f"{output}: exists already; choose another --output")
     gains = Path(settings.design) if settings.design else Path(settings.vehicle).with_name("design.json")
     plan = Plan(
         believed,

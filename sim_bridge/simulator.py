@@ -60,6 +60,7 @@ class Simulator:
         self.world.place(position, yaw, velocity)
         hover = self.vehicle.hover_thrust
         self.airframe.spin(self.airframe.speed_of(hover))
+        self.motors = [hover] * 4
         self._line = [(hover, 0.0, 0.0, 0.0)] * len(self._line)
         self._estimate = None
 

@@ -133,8 +133,10 @@ class Airframe:
         return train.hover_speed * (believed + train.speed_blend * (other - believed))
 
     def spin(self, speed: float) -> None:
-        """Set all rotors to a speed (rad/s), to start a simulation in the air."""
+        """Set all rotors to a speed (rad/s), and the battery under that load, to start a simulation in the air."""
         self.motion.speeds[:] = (speed,) * 4
+        power = sum(self.powertrain.thrust_constants) * speed**3 * self._power_per_speed
+        self.motion.voltage = self.battery.load(power + _AVIONICS_POWER)
 
     def act(
         self, position: list[float], velocity: list[float], commands: list[float], wrench: memoryview[float]
