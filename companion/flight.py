@@ -305,8 +305,9 @@ class Flight:
             if guard is not None:
                 guard.start()
         elif self.phase == LANDING and before == MISSION:
-            self.outcome = self.outcome or "finished"
-            self.on_event("info", "mission_flown", "trajectory flown, landing")
+            if not self.outcome:
+                self.outcome = "finished"
+                self.on_event("info", "mission_flown", "trajectory flown, landing")
             if guard is not None:
                 guard.stop()
 

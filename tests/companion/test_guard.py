@@ -1,0 +1,260 @@
+"""Whatever a model returns, the correction stays inside its envelope."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.guard import Guard, GuardLimits, Range
+
+LIMITS = GuardLimits(fade=0.5)
+RANGES = (Range("z", "m", 0.0, 2.0), Range("vx", "m/s", -2.0, 2.0))
+INSIDE = (1.0, 0.0)
+DT = 0.01
+
+
+class Clock:
+    """A clock that a model moves: what an inference takes."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def guard_of(model, limits=LIMITS, trips=None, clock=None) -> Guard:
+    kwargs = {} if clock is None else {"clock": clock}
+    return Guard(model, RANGES, limits, on_trip=None if trips is None else trips.append, **kwargs)
+
+
+def run(guard: Guard, seconds: float, features=INSIDE) -> list[tuple[float, float, float]]:
+    return [guard.step(features, DT)[0] for _ in range(round(seconds / DT))]
+
+
+def constant(x: float, y: float = 0.0, z: float = 0.0):
+    return lambda features: (x, y, z)
+
+
+anything = st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.floats(-4.0, 4.0))
+answers = st.one_of(
+    st.tuples(anything, anything, anything),
+    st.lists(anything, max_size=5),
+    st.none(),
+    st.text(max_size=3),
+    st.sampled_from([ValueError("no"), RuntimeError(), MemoryError()]),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            answers,
+            st.floats(0.0, 0.05),  # s that the inference takes
+            st.floats(allow_nan=True, allow_infinity=True),  # dt
+            st.tuples(anything, anything),  # features
+            st.sampled_from(["", "", "", "start", "stop"]),
+        ),
+        max_size=60,
+    )
+)
+def test_the_applied_correction_never_leaves_its_envelope(ticks) -> None:
+    clock = Clock()
+    script: list = []
+
+    def model(features):
+        answer, seconds = script[-1]
+        clock.now += seconds
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    trips: list[str] = []
+    guard = guard_of(model, trips=trips, clock=clock)
+    guard.start()
+    previous = (0.0, 0.0, 0.0)
+    for answer, seconds, dt, features, order in ticks:
+        script.append((answer, seconds))
+        if order:
+            getattr(guard, order)()
+        applied, _ = guard.step(features, dt)
+        step = min(0.1, dt) if dt > 0 else 0.0
+        for i in range(3):
+            assert math.isfinite(applied[i])
+            assert abs(applied[i]) <= LIMITS.authority[i]
+            assert abs(applied[i] - previous[i]) <= LIMITS.slew[i] * step + 1e-9
+        previous = applied
+    assert len(trips) <= 1, "a trip is told once"
+    assert bool(trips) == guard.tripped
+
+
+def test_it_fades_in_stays_and_fades_out() -> None:
+    guard = guard_of(constant(1.0))
+    assert run(guard, 0.2)[-1] == (0.0, 0.0, 0.0)
+    assert guard.status == "off"
+    guard.start()
+    rising = [x for x, _, _ in run(guard, 0.5)]
+    assert guard.status == "active"
+    assert rising[0] == pytest.approx(DT / LIMITS.fade)
+    assert all(b >= a for a, b in pairwise(rising))
+    assert run(guard, 0.3)[-1] == (1.0, 0.0, 0.0)
+    guard.stop()
+    assert guard.status == "fading_out"
+    falling = [x for x, _, _ in run(guard, 0.5)]
+    assert all(b <= a for a, b in pairwise(falling))
+    assert falling[-1] == pytest.approx(0.0)
+    assert run(guard, 0.1)[-1] == (0.0, 0.0, 0.0)
+    assert guard.status == "off"
+
+
+def test_fading_can_turn_around() -> None:
+    guard = guard_of(constant(1.0))
+    guard.start()
+    run(guard, 0.6)
+    guard.stop()
+    run(guard, 0.1)
+    guard.start()
+    assert guard.status == "fading_in"
+    assert run(guard, 0.6)[-1] == (1.0, 0.0, 0.0)
+
+
+def test_a_correction_is_cut_at_its_authority_and_tripped_when_it_stays_there() -> None:
+    trips: list[str] = []
+    guard = guard_of(constant(2 * LIMITS.authority[0]), trips=trips)
+    guard.start()
+    applied = run(guard, LIMITS.patience - 0.1)
+    assert applied[-1][0] == LIMITS.authority[0]
+    assert not guard.tripped
+    run(guard, 0.2)
+    assert guard.tripped
+    assert "authority" in trips[0]
+
+
+def test_a_short_excess_is_forgiven() -> None:
+    big = [True]
+    guard = guard_of(lambda features: (2 * LIMITS.authority[0] if big[0] else 0.1, 0.0, 0.0))
+    guard.start()
+    for _ in range(5):
+        big[0] = True
+        run(guard, 0.9 * LIMITS.patience)
+        big[0] = False
+        run(guard, 0.05)
+    assert guard.status == "active"
+
+
+@pytest.mark.parametrize(
+    ("model", "reason"),
+    [
+        (constant(math.nan), "not finite"),
+        (constant(0.0, math.inf), "not finite"),
+        (constant(0.0, 0.0, -math.inf), "not finite"),
+        (constant(0.0, 1e9), "times its authority"),
+        (lambda features: 1 / 0, "ZeroDivisionError"),
+        (lambda features: (1.0,), "ValueError"),
+        (lambda features: None, "TypeError"),
+    ],
+)
+def test_nonsense_trips_at_once_and_for_good(model, reason: str) -> None:
+    trips: list[str] = []
+    calls: list[int] = []
+
+    def counted(features):
+        calls.append(1)
+        return (1.0, 0.0, 0.0) if len(calls) < 100 else model(features)
+
+    guard = guard_of(counted, trips=trips)
+    guard.start()
+    before = run(guard, 0.99)[-1]
+    assert before == (1.0, 0.0, 0.0)
+    after = run(guard, 0.5)
+    assert guard.tripped
+    assert reason in guard.status
+    assert trips == [guard.status.removeprefix("tripped: ")]
+    assert after[0][0] == pytest.approx(1.0 - LIMITS.slew[0] * DT)
+    assert after[-1] == (0.0, 0.0, 0.0)
+    guard.start()
+    guard.stop()
+    assert run(guard, 0.5)[-1] == (0.0, 0.0, 0.0)
+    assert guard.tripped
+    assert len(calls) == 100, "a tripped model is not called again"
+
+
+def test_a_late_model_trips_after_some_misses_and_a_very_late_one_at_once() -> None:
+    clock = Clock()
+    delay = [0.0]
+
+    def model(features):
+        clock.now += delay[0]
+        return (0.1, 0.0, 0.0)
+
+    guard = guard_of(model, clock=clock)
+    guard.start()
+    for _ in range(3):  # single misses are forgiven
+        delay[0] = 1.5 * LIMITS.deadline
+        guard.step(INSIDE, DT)
+        delay[0] = 0.0
+        guard.step(INSIDE, DT)
+    assert not guard.tripped
+    delay[0] = 1.5 * LIMITS.deadline
+    for _ in range(LIMITS.misses - 1):
+        guard.step(INSIDE, DT)
+    assert not guard.tripped
+    assert guard.inference_time == pytest.approx(1.5 * LIMITS.deadline)
+    guard.step(INSIDE, DT)
+    assert guard.tripped
+    assert "inference took" in guard.status
+
+    at_once = guard_of(model, clock=clock)
+    at_once.start()
+    delay[0] = 1.1 * LIMITS.deadline * LIMITS.misses
+    at_once.step(INSIDE, DT)
+    assert at_once.tripped
+
+
+def test_outside_its_training_range_it_is_trusted_less_and_then_not_at_all() -> None:
+    trips: list[str] = []
+    guard = guard_of(constant(1.0), trips=trips)
+    guard.start()
+    run(guard, 1.0)
+    margin = 0.25 * 2.0
+    assert run(guard, 0.5, (2.0 + 0.5 * margin, 0.0))[-1][0] == pytest.approx(0.5)
+    assert run(guard, 0.5, (0.0 - 0.5 * margin, 0.0))[-1][0] == pytest.approx(0.5)
+    assert run(guard, 0.5, (2.0 + 2 * margin, 0.0))[-1][0] == 0.0
+    assert not guard.tripped
+    run(guard, 0.1)  # back inside: forgiven
+    run(guard, 0.9, (2.0 + 2 * margin, 0.0))
+    assert not guard.tripped
+    run(guard, 0.2, (2.0 + 2 * margin, 0.0))
+    assert guard.tripped
+    assert "z outside its training range" in trips[0]
+
+
+def test_a_feature_that_is_not_a_number_is_outside_every_range() -> None:
+    guard = guard_of(constant(1.0))
+    guard.start()
+    assert run(guard, 0.5, (math.nan, 0.0))[-1] == (0.0, 0.0, 0.0)
+    run(guard, 1.0, (math.nan, 0.0))
+    assert guard.tripped
+
+
+def test_a_feature_that_hardly_moved_in_training_has_a_margin_of_its_unit() -> None:
+    ranges = (Range("u_batt", "V", 16.0, 16.0), Range("T", "N", 7.0, 7.0), Range("cos_phi", "1", 1.0, 1.0))
+    guard = Guard(constant(1.0), ranges, LIMITS)
+    guard.start()
+    assert run(guard, 1.0, (15.75, 7.0, 1.0))[-1][0] == pytest.approx(0.5)
+    assert run(guard, 0.5, (16.0, 7.35, 1.0))[-1][0] == pytest.approx(0.5)
+    assert run(guard, 0.5, (16.0, 7.0, 0.95))[-1][0] == pytest.approx(0.5)
+
+
+def test_a_gap_gives_no_jump() -> None:
+    guard = guard_of(constant(2.0), GuardLimits(fade=0.01))
+    guard.start()
+    applied, _ = guard.step(INSIDE, 100.0)
+    assert applied[0] <= LIMITS.slew[0] * 0.1
+    assert guard.step(INSIDE, -1.0)[0] == applied
+    assert guard.step(INSIDE, math.nan)[0] == applied

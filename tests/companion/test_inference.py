@@ -1,0 +1,185 @@
+"""A model from the ground flies only when everything about it fits."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from onnx_models import RANGES, constant_model, drag_model, linear_model
+
+from companion.inference import MAX_BYTES, check_model
+from companion.store import ModelStore
+from models import contract
+from models.vehicle import load_vehicle
+
+VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
+RNG = np.random.default_rng(0)
+
+
+def test_a_model_that_fits_is_accepted_and_computes_what_it_should() -> None:
+    weights = RNG.normal(size=(10, 3))
+    verdict = check_model(linear_model(weights, (0.1, 0.2, 0.3)), VEHICLE)
+    assert verdict.accepted, verdict.reason
+    assert verdict.model is not None
+    for features in RNG.normal(size=(20, 10)):
+        expected = features.astype(np.float32) @ weights.astype(np.float32) + (0.1, 0.2, 0.3)
+        np.testing.assert_allclose(verdict.model(features.tolist()), expected, atol=1e-4)
+    info = verdict.model.info
+    assert not info.wants_yaw
+    assert info.chain[0]["effect"] == "rotor_drag"
+    assert [one.name for one in info.features] == list(contract.FEATURES)
+
+
+def test_a_model_with_yaw_says_so() -> None:
+    verdict = check_model(linear_model(RNG.normal(size=(12, 3))), VEHICLE)
+    assert verdict.model is not None
+    assert verdict.model.info.wants_yaw
+
+
+def feature_entries(**changes: dict[str, object]) -> list[dict[str, object]]:
+    entries = [
+        {"name": name, "unit": unit, "low": RANGES[name][0], "high": RANGES[name][1]}
+        for name, unit in contract.FEATURES.items()
+    ]
+    return [{**entry, **changes.get(str(entry["name"]), {})} for entry in entries]
+
+
+@pytest.mark.parametrize("key", contract.REQUIRED_KEYS)
+def test_every_required_key_is_required(key: str) -> None:
+    verdict = check_model(constant_model(0.1, 0.0, 0.0, drop=key), VEHICLE)
+    assert not verdict.accepted
+    assert f"'{key}'" in verdict.reason
+
+
+@pytest.mark.parametrize(
+    ("onnx", "reason"),
+    [
+        (b"", "not an ONNX model"),
+        (b"{}" * 100, "not an ONNX model"),
+        (constant_model(0, 0, 0)[:200], "not an ONNX model"),
+        (bytes(MAX_BYTES + 1), "at most"),
+        (constant_model(0, 0, 0, metadata={contract.KEY_CONTRACT: "2"}), "contract '2'"),
+        (constant_model(0, 0, 0, metadata={contract.KEY_VEHICLE: "quad5"}), "not a JSON object"),
+        (
+            constant_model(0, 0, 0, metadata={contract.KEY_VEHICLE: {"name": "quad7", "mass": 0.75}}),
+            "made for vehicle 'quad7', this one is 'quad5'",
+        ),
+        (
+            constant_model(
+                0, 0, 0, metadata={contract.KEY_VEHICLE: {"name": "quad5", "mass": 0.9, "hover_thrust": 0.38}}
+            ),
+            "made for mass 0.9",
+        ),
+        (
+            constant_model(0, 0, 0, metadata={contract.KEY_VEHICLE: {"name": "quad5", "mass": 0.75}}),
+            "made for hover_thrust None",
+        ),
+        (
+            constant_model(0, 0, 0, metadata={contract.KEY_FEATURES: feature_entries()[:9]}),
+            "its features are",
+        ),
+        (
+            constant_model(0, 0, 0, metadata={contract.KEY_FEATURES: feature_entries()[::-1]}),
+            "its features are",
+        ),
+        (
+            constant_model(0, 0, 0, metadata={contract.KEY_FEATURES: feature_entries(z={"unit": "ft"})}),
+            "with their units",
+        ),
+        (
+            constant_model(0, 0, 0, metadata={contract.KEY_FEATURES: feature_entries(z={"low": 9.0})}),
+            "training range of feature 'z'",
+        ),
+        (
+            constant_model(0, 0, 0, metadata={contract.KEY_FEATURES: [{"name": "z"}]}),
+            "name, unit, low and high",
+        ),
+        (constant_model(0, 0, 0, input_name="x"), "expected one called 'features'"),
+        (constant_model(0, 0, 0, golden_error=0.01), "a golden vector differs by 0.01"),
+        (constant_model(0, 0, 0, metadata={contract.KEY_GOLDEN_DELTA: [[0, 0, 0]]}), "at least 3 rows of 3"),
+        (constant_model(0, 0, 0, metadata={contract.KEY_GOLDEN_DELTA: [["a"]]}), "at least 3 rows of 3"),
+        (constant_model(0, 0, 0, metadata={contract.KEY_GOLDEN_DELTA: "[0, 0"}), "not a JSON list"),
+        (
+            constant_model(0, 0, 0, metadata={contract.KEY_GOLDEN_DELTA: [[0, 0, 0]] * 3}),
+            "4 golden inputs and 3",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_the_reason(onnx: bytes, reason: str) -> None:
+    verdict = check_model(onnx, VEHICLE)
+    assert not verdict.accepted
+    assert verdict.model is None
+    assert reason in verdict.reason
+    assert "\n" not in verdict.reason
+
+
+def test_a_model_with_the_wrong_width_is_refused() -> None:
+    onnx = linear_model(np.zeros((12, 3)), metadata={contract.KEY_FEATURES: feature_entries()})
+    assert "expected tensor(float) [N, 10]" in check_model(onnx, VEHICLE).reason
+
+
+def test_a_model_that_overflows_inside_its_range_is_refused() -> None:
+    weights = np.zeros((10, 3))
+    weights[8, 0] = 1e38  # times a battery voltage: infinity in single precision
+    golden = [[0.0] * 10] * 3
+    onnx = linear_model(
+        weights, metadata={contract.KEY_GOLDEN_FEATURES: golden, contract.KEY_GOLDEN_DELTA: [[0.0] * 3] * 3}
+    )
+    assert "not finite inside its own training range" in check_model(onnx, VEHICLE).reason
+
+
+def test_a_model_that_is_too_slow_is_refused() -> None:
+    onnx = linear_model(np.eye(10, 3), extra_nodes=2000)
+    verdict = check_model(onnx, VEHICLE, deadline=1e-5)
+    assert "at most" in verdict.reason
+    assert check_model(onnx, replace(VEHICLE), deadline=1.0).accepted
+
+
+class TestStore:
+    def test_the_last_accepted_model_is_live_and_survives_a_restart(self, tmp_path: Path) -> None:
+        store = ModelStore(tmp_path, VEHICLE, 0.1)
+        assert store.live is None
+        first, second = constant_model(0.1, 0, 0), drag_model(0.2)
+        assert store.deploy(first)["accepted"]
+        answer = store.deploy(second)
+        assert answer["live"] == contract.model_hash(second)
+        assert [entry["hash"] for entry in answer["models"]] == [
+            contract.model_hash(m) for m in (first, second)
+        ]
+        again = ModelStore(tmp_path, VEHICLE, 0.1)
+        assert again.live is not None
+        assert again.live.info.hash == contract.model_hash(second)
+        assert again.refused_at_start == []
+
+    def test_a_refused_model_leaves_the_live_one_alone(self, tmp_path: Path) -> None:
+        store = ModelStore(tmp_path, VEHICLE, 0.1)
+        store.deploy(constant_model(0.1, 0, 0))
+        answer = store.deploy(b"nonsense")
+        assert not answer["accepted"]
+        assert store.live is not None
+        assert store.live([0.0] * 10) == pytest.approx([0.1, 0.0, 0.0])
+
+    def test_rolling_back_goes_through_the_earlier_models_to_none(self, tmp_path: Path) -> None:
+        store = ModelStore(tmp_path, VEHICLE, 0.1)
+        store.deploy(constant_model(0.1, 0, 0))
+        store.deploy(constant_model(0.2, 0, 0))
+        assert store.roll_back()["accepted"]
+        assert store.live is not None
+        assert store.live([0.0] * 10) == pytest.approx([0.1, 0.0, 0.0])
+        assert store.roll_back()["live"] == ""
+        assert store.live is None
+        assert not store.roll_back()["accepted"]
+
+    def test_a_model_that_no_longer_fits_is_not_live_after_a_restart(self, tmp_path: Path) -> None:
+        ModelStore(tmp_path, VEHICLE, 0.1).deploy(constant_model(0.1, 0, 0))
+        heavier = ModelStore(tmp_path, replace(VEHICLE, mass=0.9), 0.1)
+        assert heavier.live is None
+        assert "made for mass" in heavier.refused_at_start[0]
+        for path in tmp_path.glob("*.onnx"):
+            path.write_bytes(path.read_bytes()[:-10])
+        assert ModelStore(tmp_path, VEHICLE, 0.1).live is None
+        (tmp_path / "history.json").write_text(json.dumps(["absent"]))
+        assert "absent" in ModelStore(tmp_path, VEHICLE, 0.1).refused_at_start[0]
