@@ -16,11 +16,11 @@ import numpy as np
 from scipy import stats
 
 from groundstation.fitting import (
-    HAC_LAG,
     Fit,
     Problem,
     block_errors,
     fit,
+    long_run_variance,
     model_of,
 )
 from groundstation.measurement import Measurement, measure
@@ -37,7 +37,9 @@ MATERIAL_SHARE = 0.01
 MATERIAL_ACCELERATION = 0.02
 """m/s² RMS; smaller effects are within the bias stability of a MEMS accelerometer (2 mg)."""
 SCREENED = 3
-"""Candidates fitted in full at each step."""
+"""Acceptable candidates fitted in full at each step, the most promising first."""
+STRONG_EVIDENCE = 6.0
+"""Twice the log likelihood ratio from which one explanation is told from another (Kass & Raftery 1995)."""
 MOST_EFFECTS = 6
 
 
@@ -194,10 +196,14 @@ class _Search:
             scored.append((self._screen(current, step), step))
         scored.sort(reverse=True)
         best: _State | None = None
-        for _, step in scored[:SCREENED]:
+        accepted = 0
+        for promise, step in scored:
+            if accepted == SCREENED or promise < MATERIAL_SHARE * current.fit.sse:
+                break
             candidate = self.state((*current.added, *step))
-            if not self._acceptable(candidate, current, step):
+            if not self._acceptable(candidate, current, step) or not all(self._shows(current, n) for n in step):
                 continue
+            accepted += 1
             if best is None or self._score(candidate) < self._score(best):
                 best = candidate
         return best
@@ -233,6 +239,27 @@ class _Search:
         )[0]
         return float(residual @ matrix @ solution)
 
+    def _contribution(self, current: _State, name: str) -> np.ndarray:
+        """What the effect at its typical size changes in the predicted specific force, (K A, P): one column each."""
+        values = {t.effect: dict(t.values) for t in current.fit.terms}
+        effect = self.known[name]
+        rest = [(self.known[n], v) for n, v in values.items() if n != name]
+        neutral = values.get(name, effect.neutral(self.problem.vehicle))
+        base = self.problem.predict([*rest, (effect, neutral)])
+        return np.column_stack(
+            [(self.problem.predict([*rest, (effect, {**neutral, p.name: p.typical})]) - base).ravel() for p in effect.parameters]
+        )
+
+    def _shows(self, current: _State, name: str) -> bool:
+        """Whether the effect at its typical size would matter beyond the simpler effects it coincides with."""
+        beyond = [n for n in self.known[name].beyond if n in self.candidates or n in self.base.names()]
+        if not beyond:
+            return True
+        mine = self._contribution(current, name).sum(axis=1)
+        simpler = np.column_stack([self._contribution(current, n) for n in beyond])
+        rest = mine - simpler @ np.linalg.lstsq(simpler, mine, rcond=None)[0]
+        return bool(np.sqrt(np.sum(rest**2) / len(self.problem.measured())) > MATERIAL_ACCELERATION)
+
     def _gain(self, with_: _State, without: _State) -> float:
         """Part of the remaining squared error on held-out blocks that `with_` takes away."""
         return (without.cv_total - with_.cv_total) / with_.cv_total
@@ -262,8 +289,6 @@ class _Search:
             weakest = None
             for name in current.added:
                 without = self._without(current, name)
-                if without is None:
-                    continue
                 useful = (
                     self._gain(current, without) > MATERIAL_SHARE
                     and current.fit.wald(name) < SIGNIFICANCE
@@ -275,12 +300,11 @@ class _Search:
                 return current
             current = weakest
 
-    def _without(self, current: _State, name: str) -> _State | None:
+    def _without(self, current: _State, name: str) -> _State:
+        """The state without the effect, and without those that act only through it."""
         rest = tuple(n for n in current.added if n != name)
         present = {*self.base.names(), *rest}
-        if any(self.known[n].with_any and not present & set(self.known[n].with_any) for n in rest):
-            return None
-        return self.state(rest)
+        return self.state(tuple(n for n in rest if not self.known[n].with_any or present & set(self.known[n].with_any)))
 
     def _agrees_with_held_out(self, current: _State) -> _State:
         """Drop effects that predict the held-out flight worse than the model without them."""
@@ -292,11 +316,10 @@ class _Search:
             worse = []
             for name in current.added:
                 without = self._without(current, name)
-                if without is not None:
-                    error = self._held_out_error(without)
-                    assert error is not None
-                    if error < here * (1.0 - MATERIAL_SHARE):
-                        worse.append((error, without))
+                error = self._held_out_error(without)
+                assert error is not None
+                if error < here * (1.0 - MATERIAL_SHARE):
+                    worse.append((error, without))
             if not worse:
                 break
             current = min(worse, key=lambda w: w[0])[1]
@@ -324,23 +347,17 @@ class _Search:
             rest):
                 continue
             other = self.state((*rest, rival))
-            if not self._plausible(other.fit, rival) or other.fit.wald(rival) > SIGNIFICANCE:
+            if not self._plausible(other.fit, rival):
                 continue
-            difference = np.sum(other.fit.residual**2, axis=1) - np.sum(current.fit.residual**2, axis=1)
-            cost = difference.sum() / current.fit.sse
-            if cost < MATERIAL_SHARE or (cost < 5 * MATERIAL_SHARE and self._z(difference) < 2.0):
+            if self._evidence(current.fit, other.fit) < STRONG_EVIDENCE:
                 found.append(rival)
         return tuple(found)
 
-    def _z(self, difference: np.ndarray) -> float:
-        """Vuong's statistic of a difference of squared errors, with a Newey-West deviation (Vuong 1989)."""
-        m = self.problem.measurements[0]
-        placed = np.zeros(len(m.t))
-        placed[m.used] = difference - difference.mean()
-        lag = max(1, round(HAC_LAG / float(np.median(np.diff(m.t)))))
-        sums = np.convolve(placed, np.ones(lag), mode="full")
-        variance = float(np.sum(sums**2)) / lag
-        return float(difference.sum() / np.sqrt(variance)) if variance > 0 else 0.0
+    def _evidence(self, for_: Fit, against: Fit) -> float:
+        """Evidence for one fit against another with as many effects, on the scale of twice a log likelihood ratio:
+        squared error in units of one independent sample, and the distance of the parameters from "no effect"."""
+        unit = long_run_variance(self.problem, for_.residual)
+        return (against.sse - for_.sse) / unit + against.surprise - for_.surprise
 
     def _report(self, current: _State) -> Diagnosis:
         before = self._before()
@@ -348,9 +365,7 @@ class _Search:
         rivals = {n: self._rivals(current, n) for n in current.added}
         found = []
         for name in current.added:
-            without = self._without(current, name)
-            sse = before * self.samples if without is None else without.fit.sse
-            share = (sse - current.fit.sse) / (before * self.samples)
+            share = (self._without(current, name).fit.sse - current.fit.sse) / (before * self.samples)
             found.append((share, name))
         found.sort(reverse=True)
         for rank, (share, name) in enumerate(found, 1):

@@ -1,6 +1,8 @@
 """Fitting the parameters of a chain of effects to flights, with intervals that hold under correlated residuals.
 
-Least squares on specific force, body axes, every axis with the same weight. Residuals of flight data at 100 Hz are
+Least squares on specific force, body axes, every axis with the same weight, with a weak prior at "no effect" for each
+parameter (two typical sizes wide, worth one independent sample): it decides only what the data leave open, such as
+thrust gain against accelerometer bias in a hover. Residuals of flight data at 100 Hz are
 strongly autocorrelated, so ordinary intervals would be far too narrow: covariances here are Newey-West with a
 Bartlett kernel of `HAC_LAG` s, and critical values are the fixed-b ones of Kiefer and Vogelsang (2005), "A new
 asymptotic theory for heteroskedasticity-autocorrelation robust tests", Econometric Theory 21, table 1.
@@ -8,7 +10,7 @@ asymptotic theory for heteroskedasticity-autocorrelation robust tests", Economet
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +26,9 @@ from models.vehicle import Vehicle
 
 HAC_LAG = 2.0
 """s of Bartlett kernel: beyond the slowest correlation that a position-controlled quadrotor shows."""
+UNMODELLED = 0.02
+"""m/s²: slow model error that every flight is granted, for the weight of the prior: 2 mg, the bias stability of a
+MEMS accelerometer."""
 BLOCK = 5.0
 """s of each held-out block."""
 
@@ -40,6 +45,11 @@ class Free:
     neutral: float
     tolerance: float = 0.0
     nuisance: bool = False
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the prior."""
+        return max(2.0 * abs(self.parameter.typical - self.neutral), 1e-6)
 
 
 @dataclass(frozen=True)
@@ -65,6 +75,13 @@ class Problem:
     def measured(self) -> np.ndarray:
         """Measured specific force (K, A) of the used samples."""
         return np.concatenate([m.value[m.used][:, m.axes] for m in self.measurements])
+
+    def unit(self) -> float:
+        """Squared error worth one independent sample, (m/s²)²: noise and unmodelled error over the correlation time."""
+        m = self.measurements[0]
+        rate = 1.0 / float(np.median(np.diff(m.t)))
+        noise = float(np.mean(m.noise[list(m.axes)] ** 2))
+        return noise + UNMODELLED**2 * max(1.0, HAC_LAG * rate)
 
     def blocks(self) -> np.ndarray:
         """Number of the held-out block of each used sample (K,)."""
@@ -92,6 +109,11 @@ class Fit:
     critical: float
     jacobian: np.ndarray
     residual: np.ndarray
+
+    @property
+    def surprise(self) -> float:
+        """How far the parameters are from "no effect", in squared standard deviations of the prior."""
+        return float(sum(((x - f.neutral) / f.spread) ** 2 for x, f in zip(self.estimate, self.free, strict=True)))
 
     @property
     def sse(self) -> float:
@@ -185,25 +207,27 @@ def fit(
             values[f.effect][f.parameter.name] = float(value)
         return (measured - problem.predict([(e, values[e.name]) for e in effects])).ravel()
 
-    scale = np.array([max(abs(f.parameter.typical - _typical_base(f, vehicle)), 1e-6) for f in free])
+    weight = np.sqrt(problem.unit()) / np.array([f.spread for f in free])
+    neutral = np.array([f.neutral for f in free])
     if free:
         solution = optimize.least_squares(
-            residual,
+            lambda x: np.concatenate([residual(x), weight * (x - neutral)]),
             np.array([f.start for f in free]),
-            jac=lambda x: _jacobian(residual, x, free, scale),
+            jac=lambda x: np.concatenate([_jacobian(residual, x, free), np.diag(weight)]),
             bounds=([f.low for f in free], [max(f.high, f.low + 1e-9) for f in free]),
-            x_scale=scale,
+            x_scale=np.array([f.spread for f in free]),
             ftol=tolerance,
             xtol=1e-5,
             gtol=1e-12,
             max_nfev=25,
         )
-        estimate, flat, jacobian = solution.x, solution.fun, solution.jac
+        estimate, flat = solution.x, solution.fun[: measured.size]
+        jacobian = solution.jac[: measured.size]
     else:
         estimate, flat, jacobian = np.zeros(0), residual(np.zeros(0)), np.zeros((measured.size, 0))
     k, a = measured.shape
     shaped = jacobian.reshape(k, a, len(free))
-    covariance, critical = robust_covariance(problem, shaped, flat.reshape(k, a))
+    covariance, critical = robust_covariance(problem, shaped, flat.reshape(k, a), weight)
     values = {name: dict(fixed.get(name, {})) for name in chain_names}
     intervals: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in chain_names}
     for i, f in enumerate(free):
@@ -217,32 +241,31 @@ def fit(
     return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a))
 
 
-def _typical_base(free: Free, vehicle: Vehicle) -> float:
-    return free.parameter.neutral_for(vehicle)
-
-
-def _jacobian(residual: object, x: np.ndarray, free: Sequence[Free], scale: np.ndarray) -> np.ndarray:
-    """Forward differences with steps of a hundredth of each parameter's typical size, away from its upper bound."""
-    base = residual(x)  # type: ignore[operator]
+def _jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, free: Sequence[Free]) -> np.ndarray:
+    """Forward differences with steps of a hundredth of each prior's width, away from the upper bound."""
+    base = residual(x)
     columns = np.empty((base.size, len(x)))
     for i, f in enumerate(free):
-        step = 0.02 * scale[i]
+        step = 0.01 * f.spread
         if x[i] + step > f.high:
             step = -step
         moved = x.copy()
         moved[i] += step
-        columns[:, i] = (residual(moved) - base) / step  # type: ignore[operator]
+        columns[:, i] = (residual(moved) - base) / step
     return columns
 
 
-def robust_covariance(problem: Problem, jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, float]:
-    """Newey-West sandwich covariance (P, P) of least squares with `jacobian` (K, A, P) and `residual` (K, A), and
-    its fixed-b factor for 95 %."""
+def robust_covariance(
+    problem: Problem, jacobian: np.ndarray, residual: np.ndarray, prior: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Newey-West sandwich covariance (P, P) of least squares with `jacobian` (K, A, P), `residual` (K, A) and weights
+    `prior` (P,) of the prior's rows, and its fixed-b factor for 95 %."""
     k, a, p = jacobian.shape
     flat = jacobian.reshape(k * a, p)
-    bread = np.linalg.pinv(flat.T @ flat, hermitian=True)
+    pull = np.diag(prior**2)
+    bread = np.linalg.pinv(flat.T @ flat + pull, hermitian=True)
     scores = np.einsum("kap,ka->kp", jacobian, residual)
-    meat, offset, seconds = np.zeros((p, p)), 0, 0.0
+    meat, offset, seconds = pull * problem.unit(), 0, 0.0
     for m in problem.measurements:
         # the samples in their places in time, with zeros for those left out, so that lags are lags
         placed = np.zeros((len(m.t), p))
@@ -254,6 +277,21 @@ def robust_covariance(problem: Problem, jacobian: np.ndarray, residual: np.ndarr
         seconds += float(m.used.sum()) * period
     covariance = bread @ meat @ bread * (k / max(k - p, 1))
     return covariance, critical_value(seconds)
+
+
+def long_run_variance(problem: Problem, residual: np.ndarray) -> float:
+    """Variance of `residual` (K, A) that counts for slow regressors: Bartlett kernel of `HAC_LAG` s, mean over axes,
+    and never less than the plain mean square."""
+    total, offset = 0.0, 0
+    for m in problem.measurements:
+        count = int(m.used.sum())
+        placed = np.zeros((len(m.t), residual.shape[1]))
+        placed[m.used] = residual[offset : offset + count]
+        lag = max(1, round(HAC_LAG / float(np.median(np.diff(m.t)))))
+        sums = np.cumsum(np.pad(placed, ((lag, lag), (0, 0))), axis=0)
+        total += float(np.sum((sums[lag:] - sums[:-lag]) ** 2)) / lag
+        offset += count
+    return max(total, float(np.sum(residual**2))) / residual.size
 
 
 def block_errors(fit_: Fit, blocks: np.ndarray) -> np.ndarray:

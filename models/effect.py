@@ -92,7 +92,8 @@ class Effect:
 
     `needs` names the columns of `models.flight.COLUMNS` it reads; `with_any` the effects of which one must be in the
     model for this one to act (wind acts through drag); `exports` is False for an effect with memory, which a static
-    correction cannot hold. `aliases` are physical quantities that no flight can tell apart from this effect.
+    correction cannot hold. `beyond` names simpler effects with which this one coincides unless the flight varies what it
+    depends on (a bent thrust curve in a hover is a thrust gain). `aliases` are physical quantities that no flight can tell apart from this effect.
     """
 
     name: str
@@ -106,6 +107,7 @@ class Effect:
     confounded_with: tuple[str, ...] = ()
     with_any: tuple[str, ...] = ()
     aliases: tuple[str, ...] = ()
+    beyond: tuple[str, ...] = ()
     exports: bool = True
 
     def apply(self, motion: Motion, values: Mapping[str, Any]) -> Motion:

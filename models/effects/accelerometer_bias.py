@@ -18,10 +18,10 @@ EFFECT = Effect(
     stage=Stage.SENSOR,
     formula=formula,
     parameters=tuple(
-        Parameter(axis, "m/s^2", f"offset along body {axis}", 0.0, 0.2, -2.0, 2.0) for axis in ("x", "y", "z")
+        Parameter(axis, "m/s^2", f"offset along body {axis}", 0.0, 0.1, -0.8, 0.8) for axis in ("x", "y", "z")
     ),
     needs=("specific_force",),
     manoeuvre="hover at several headings, and tilts both ways",
-    citation="IEEE Std 1293 error model of a linear accelerometer, bias term",
+    citation="IEEE Std 1293, bias term of the accelerometer model; range: 80 mg zero-g offset of MEMS data sheets",
     confounded_with=("thrust_gain", "thrust_curve", "wind"),
 )
