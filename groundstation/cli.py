@@ -1,0 +1,31 @@
+"""`groundstation`: see where a vehicle does not fly as designed, name why, correct it, and watch."""
+
+from __future__ import annotations
+
+import typer
+
+from groundstation import analysis_commands, flight_commands, pilot_commands
+from models.errors import run_command_line
+
+app = typer.Typer(
+    name="groundstation",
+    help="Runs on the operator's machine: reads flights, compares them with models, names missing effects, "
+    "and "
+    "commands the companion.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+)
+flight_commands.register(app)
+analysis_commands.register(app)
+pilot_commands.register(app)
+
+
+def main() -> None:
+    """Entry point of the `groundstation` program."""
+    run_command_line(app)
+
+
+if __name__ == "__main__":
+    main()

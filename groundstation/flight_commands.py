@@ -1,0 +1,359 @@
+"""Command lines of flights and of the linear design: import, flights, design, track."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from models.errors import InputError
+
+if TYPE_CHECKING:
+    from groundstation.tracking import Tracking
+    from models.flight import Flight
+
+console = Console()
+
+FlightFile = Annotated[Path, typer.Argument(help="A flight: CSV, Parquet, MCAP record or PX4 ULog.")]
+VehicleOption = Annotated[
+    Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
+]
+MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML that maps the file's columns.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the ground station's application."""
+    app.command("flights", epilog="Example: groundstation flights samples")(flights_command)
+    app.command(
+        "import",
+        epilog="Example: groundstation import log.csv --mapping mine.mapping.toml --vehicle vehicle.toml "
+        "-o flight.csv",
+    )(import_command)
+    app.command(
+        "design", epilog="Example: groundstation design models/vehicles/quad5/vehicle.toml -o design.json"
+    )(design_command)
+    app.command("track", epilog="Example: groundstation track before.mcap after.mcap")(track_command)
+
+
+def flights_command(
+    directory: Annotated[Path, typer.Argument(help="Folder to look through.")] = Path("flights"),
+    as_json: JsonOption = False,
+) -> None:
+    """The flights in a folder: what was flown, how long, and what was measured."""
+    from rich.progress import track as progress
+
+    from groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
+
+    if not directory.is_dir():
+        raise InputError(f"{directory}: no such folder; pass the one that holds your flights")
+    endings = (*TABLES, *RECORDS, *ULOGS)
+    files = sorted(
+        f
+        for f in directory.rglob("*")
+        if f.suffix.lower() in endings and f.is_file() and not f.name.startswith(".")
+    )
+    shown = (
+        files if as_json or len(files) < 4 else progress(files, "reading", console=console, transient=True)
+    )
+    rows = [_flight_row(file, directory) for file in shown]
+    if as_json:
+        typer.echo(json.dumps(rows, indent=1))
+        return
+    from rich.table import Table
+
+    table = Table(caption=f"{len(rows)} files in {directory}", caption_justify="left")
+    table.add_column("flight", overflow="fold", min_width=24)
+    table.add_column("date", no_wrap=True)
+    for heading in ("length", "in air", "rate"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    flown = any(row["trajectory"] for row in rows)
+    if flown:
+        table.add_column("flown")
+    table.add_column("measured", overflow="fold")
+    for row in rows:
+        cells = [escape(str(row["flight"])), row["date"][2:]]
+        if row["error"]:
+            reason = str(row["error"]).removeprefix(str(directory / str(row["flight"]))).lstrip(":, ")
+            cells += ["", "", "", *[""] * flown, f"[red]{escape(reason)}[/red]"]
+        else:
+            cells += [f"{row['duration']:.1f} s", f"{row['flying']:.1f} s", f"{row['rate']:.0f} Hz"]
+            words = (row["trajectory"], row["controller"], row["model"])
+            cells += [escape(" ".join(word for word in words if word))] * flown
+            cells.append(" ".join(SHORT[word] for word in row["measured"]))
+        table.add_row(*cells)
+    console.print(table)
+    if not files:
+        console.print(f"no flights in {directory} (known endings: {', '.join(endings)})")
+
+
+SENSORS = {
+    "specific_force": "accelerometer",
+    "position": "position",
+    "quaternion": "attitude",
+    "angular_velocity": "gyroscope",
+    "battery_voltage": "battery",
+    "rotor_speed": "rotor speeds",
+    "motor_command": "motor commands",
+    "position_reference": "reference",
+}
+
+SHORT = {
+    "accelerometer": "acc",
+    "position": "pos",
+    "attitude": "att",
+    "gyroscope": "gyro",
+    "battery": "batt",
+    "rotor speeds": "rpm",
+    "motor commands": "motors",
+    "reference": "ref",
+}
+
+
+def _flight_row(file: Path, directory: Path) -> dict[str, Any]:
+    """What the table tells of one file; a file that cannot be read tells why."""
+    from groundstation.reading import read_flight
+
+    stamp = datetime.fromtimestamp(file.stat().st_mtime, UTC)
+    row: dict[str, Any] = {
+        "flight": str(file.relative_to(directory)),
+        "date": stamp.strftime("%Y-%m-%d %H:%M"),
+        "trajectory": "",
+        "controller": "",
+        "model": "",
+        "error": "",
+    }
+    try:
+        flight = read_flight(file)
+        if file.suffix.lower() == ".mcap":
+            row |= _record_facts(file)
+    except InputError as error:
+        return {**row, "error": str(error)}
+    flying = 1.0 if flight.flying is None else float(flight.flying.mean())
+    return {
+        **row,
+        "vehicle": flight.vehicle.name,
+        "duration": round(flight.duration, 2),
+        "flying": round(flying * len(flight) * flight.dt, 2),
+        "rate": round(1.0 / flight.dt, 1),
+        "measured": [word for name, word in SENSORS.items() if flight.has(name)],
+        "notes": list(flight.notes),
+    }
+
+
+def _record_facts(file: Path) -> dict[str, Any]:
+    from models.record import read_record
+
+    record = read_record(file)
+    facts = {name: record.metadata.get(name, "") for name in ("trajectory", "controller", "model")}
+    created = record.metadata.get("created_ns", "")
+    if created.isdigit():
+        facts["date"] = datetime.fromtimestamp(int(created) * 1e-9, UTC).strftime("%Y-%m-%d %H:%M")
+    return facts
+
+
+def import_command(
+    file: FlightFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Where to: .csv or .parquet.")],
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Read any flight, check it, and write it in the project's own format with its vehicle file beside it."""
+    from groundstation.reading import read_flight
+    from groundstation.reading.writing import own_table, write_flight
+
+    if output.resolve() == file.resolve():
+        raise InputError(f"{output}: that is the file itself; choose another -o, the original stays as it is")
+    flight = read_flight(file, vehicle, mapping)
+    vehicle_path = write_flight(flight, output)
+    if as_json:
+        typer.echo(
+            json.dumps(
+                {
+                    "flight": str(output),
+                    "vehicle": str(vehicle_path),
+                    "samples": len(flight),
+                    "duration": round(flight.duration, 3),
+                    "columns": list(own_table(flight)),
+                    "notes": list(flight.notes),
+                },
+                indent=1,
+            )
+        )
+        return
+    console.print(
+        f"{escape(str(output))}: {len(flight)} samples, {flight.duration:.1f} s at {1 / flight.dt:.0f} Hz"
+    )
+    console.print(f"{escape(str(vehicle_path))}: the vehicle as it was believed to be")
+    _print_notes(flight)
+
+
+def design_command(
+    vehicle: Annotated[Path, typer.Argument(help="vehicle.toml")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Design file; default: design.json beside it.")
+    ] = None,
+    bandwidth: Annotated[float | None, typer.Option(help="Position loop, Hz.")] = None,
+    attitude_bandwidth: Annotated[float | None, typer.Option(help="Attitude loop, Hz.")] = None,
+    rate: Annotated[float, typer.Option(help="Control rate, Hz.")] = 100.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Gains of the linear cascade by LQR, for the companion, and what the closed loop will do."""
+    from groundstation.linear_design import (
+        ATTITUDE_BANDWIDTH,
+        POSITION_BANDWIDTH,
+        actuation,
+        loops,
+        make_design,
+    )
+    from models.design import save_design
+    from models.vehicle import load_vehicle
+
+    believed = load_vehicle(vehicle)
+    design = make_design(
+        believed, bandwidth or POSITION_BANDWIDTH, attitude_bandwidth or ATTITUDE_BANDWIDTH, rate
+    )
+    target = output or vehicle.with_name("design.json")
+    partial = target.with_name(f".{target.name}.part")
+    try:
+        save_design(design, partial)
+        partial.replace(target)
+    except OSError as error:
+        raise InputError(f"{target}: cannot write the design ({error.strerror}); choose another -o") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    found = loops(design, believed)
+    if as_json:
+        typer.echo(
+            json.dumps(
+                {
+                    "design": str(target),
+                    "K_zeta": design.K_zeta,
+                    "K_eta": design.K_eta,
+                    "loops": [
+                        {
+                            "name": loop.name,
+                            "poles": [[p.real, p.imag] for p in loop.poles],
+                            "crossover": loop.crossover,
+                            "phase_margin_deg": loop.phase_margin,
+                            "rise_time": loop.rise_time,
+                            "settling_time": loop.settling_time,
+                            "overshoot": loop.overshoot,
+                        }
+                        for loop in found
+                    ],
+                },
+                indent=1,
+            )
+        )
+        return
+    from rich.table import Table
+
+    delay, lag = actuation(believed, rate)
+    table = Table(title=f"{believed.name}: closed loop, step of the reference")
+    for heading in (
+        "loop",
+        "poles (1/s)",
+        "rise",
+        "settles",
+        "overshoot",
+        f"margin at {1e3 * delay:.0f} + {1e3 * lag:.0f} ms",
+    ):
+        table.add_column(heading, justify="left" if heading in ("loop", "poles (1/s)") else "right")
+    for loop in found:
+        table.add_row(
+            loop.name,
+            _poles(loop.poles),
+            f"{loop.rise_time:.2f} s",
+            f"{loop.settling_time:.2f} s",
+            f"{100 * loop.overshoot:.0f} %",
+            f"{loop.phase_margin:.0f} deg",
+        )
+    console.print(table)
+    k_zeta, k_eta = design.K_zeta, design.K_eta
+    console.print(f"K_zeta  roll, pitch {k_zeta[0][0]:.2f}, yaw {k_zeta[2][2]:.2f} 1/s")
+    console.print(
+        f"K_eta   tilt {k_eta[1][0]:.3f} rad/m, {k_eta[1][3]:.3f} rad s/m; thrust {k_eta[2][2]:.2f} N/m, "
+        f"{k_eta[2][5]:.2f} N s/m",
+        highlight=False,
+    )
+    console.print(f"design: {escape(str(target))}")
+
+
+def _poles(poles: tuple[complex, ...]) -> str:
+    words = [
+        f"{p.real:.1f}" if abs(p.imag) < 1e-6 else f"{p.real:.1f} ± {abs(p.imag):.1f}i"
+        for p in poles
+        if p.imag >= -1e-6
+    ]
+    return ", ".join(words)
+
+
+def track_command(
+    flights: Annotated[list[Path], typer.Argument(help="One flight or more, usually before and after.")],
+    design: Annotated[
+        Path | None, typer.Option("--design", help="Design file; default: that of the record.")
+    ] = None,
+    vehicle: VehicleOption = None,
+    rrd: Annotated[Path | None, typer.Option("--rrd", help="Write a Rerun recording here.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Flights against the linear behaviour expected of them: mean squared error per axis, as in the paper."""
+    from groundstation.tracking import track_file
+
+    tracked = [track_file(path, design, vehicle) for path in flights]
+    if rrd is not None:
+        from groundstation.views import write_tracking
+
+        write_tracking(rrd, tracked)
+    if as_json:
+        typer.echo(json.dumps([_tracking_row(t, tracked[0]) for t in tracked], indent=1))
+        return
+    from rich.table import Table
+
+    table = Table(title="mean squared error against the expected linear behaviour")
+    for heading in (
+        "flight",
+        "x (m²)",
+        "y (m²)",
+        "z (m²)",
+        "roll (rad²)",
+        "pitch (rad²)",
+        "yaw (rad²)",
+        "rms (m)",
+        "change",
+    ):
+        table.add_column(
+            heading, justify="left" if heading == "flight" else "right", no_wrap=heading != "flight"
+        )
+    for t in tracked:
+        row = _tracking_row(t, tracked[0])
+        change = "" if t is tracked[0] else f"{100 * row['change']:+.0f} %"
+        table.add_row(escape(t.label), *(f"{v:.2e}" for v in (*t.mse, *t.mse_zeta)), f"{t.rms:.3f}", change)
+    console.print(table)
+    if rrd is not None:
+        console.print(f"Rerun recording: {escape(str(rrd))}")
+
+
+def _tracking_row(tracking: Tracking, first: Tracking) -> dict[str, Any]:
+    return {
+        "flight": tracking.flight.origin,
+        "label": tracking.label,
+        "seconds": round(len(tracking.t) * tracking.flight.dt, 2),
+        "mse": dict(zip("xyz", tracking.mse, strict=True)),
+        "unit": "m^2",
+        "mse_zeta": dict(zip(("roll", "pitch", "yaw"), tracking.mse_zeta, strict=True)),
+        "rms": tracking.rms,
+        "change": sum(tracking.mse) / sum(first.mse) - 1.0,
+    }
+
+
+def _print_notes(flight: Flight) -> None:
+    for note in flight.notes:
+        console.print(f"note: {escape(note)}", style="yellow")

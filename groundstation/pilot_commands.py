@@ -1,0 +1,389 @@
+"""Command lines that talk to a companion over Zenoh: fly, deploy, status, monitor."""
+
+from __future__ import annotations
+
+import json
+import queue
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from models.errors import InputError
+
+if TYPE_CHECKING:
+    from groundstation.link import Link
+    from groundstation.settings import Settings
+    from models.record_pb2 import Event
+
+console = Console()
+
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="Settings (groundstation.toml); flags override it.")
+]
+NameOption = Annotated[
+    str | None, typer.Option("--name", help="Vehicle; default: the only one that answers.")
+]
+ConnectOption = Annotated[
+    list[str] | None, typer.Option("-e", "--connect", help="Zenoh endpoint of the companion.")
+]
+ModeOption = Annotated[str | None, typer.Option("-m", "--mode", help="Zenoh mode: peer, client, router.")]
+ListenOption = Annotated[
+    list[str] | None, typer.Option("-l", "--listen", help="Zenoh endpoint to listen on.")
+]
+ZenohOption = Annotated[Path | None, typer.Option("-c", "--zenoh-config", help="Zenoh configuration file.")]
+CfgOption = Annotated[list[str] | None, typer.Option("--cfg", help="Zenoh setting, KEY:VALUE.")]
+TimeoutOption = Annotated[
+    float | None, typer.Option("--timeout", help="Seconds to wait for an answer.", min=0.1)
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+
+ENDED = ("finished", "failed", "aborted")
+STYLES = {"warning": "yellow", "error": "red"}
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the ground station's application."""
+    app.command(
+        "fly", epilog="Example: groundstation fly lemniscate --set speed=2 --controller corrected --wait"
+    )(fly_command)
+    app.command("deploy", epilog="Example: groundstation deploy quad5-v3.onnx")(deploy_command)
+    app.command("status", epilog="Example: groundstation status -e tcp/192.168.1.7:7447 --json")(
+        status_command
+    )
+    app.command("monitor", epilog="Example: groundstation monitor --save flight.rrd")(monitor_command)
+
+
+def _settings(
+    config: Path | None,
+    name: str | None,
+    connect: list[str] | None,
+    mode: str | None,
+    listen: list[str] | None,
+    zenoh_config: Path | None,
+    cfg: list[str] | None,
+    timeout: float | None,
+) -> Settings:
+    from groundstation.settings import load_settings
+
+    given: dict[str, Any] = {
+        "name": name,
+        "connect": tuple(connect) if connect else None,
+        "mode": mode,
+        "listen": tuple(listen) if listen else None,
+        "zenoh_config": str(zenoh_config) if zenoh_config else None,
+        "cfg": tuple(cfg) if cfg else None,
+        "timeout": timeout,
+    }
+    return replace(load_settings(config), **{key: value for key, value in given.items() if value is not None})
+
+
+def fly_command(
+    trajectory: Annotated[
+        str, typer.Argument(help="Name of a trajectory (`groundstation fly list`), or a CSV of setpoints.")
+    ],
+    controller: Annotated[str, typer.Option(help="lqr, or corrected by the deployed model.")] = "lqr",
+    parameters: Annotated[
+        list[str] | None, typer.Option("--set", help="Parameter of the trajectory, NAME=VALUE.")
+    ] = None,
+    repeat: Annotated[int, typer.Option(help="How often.", min=1, max=100)] = 1,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Follow the flight to its end and fetch its record.")
+    ] = False,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder for the record.")] = None,
+    config: ConfigOption = None,
+    name: NameOption = None,
+    connect: ConnectOption = None,
+    mode: ModeOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ZenohOption = None,
+    cfg: CfgOption = None,
+    timeout: TimeoutOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Ask the companion to fly a trajectory; with --wait, follow it and fetch the flight record."""
+    if trajectory == "list":
+        _list_trajectories(as_json)
+        return
+    if controller not in ("lqr", "corrected"):
+        raise InputError(f"--controller is '{controller}'; it must be lqr or corrected")
+    mission = {**_mission(trajectory, parameters or []), "controller": controller, "repeat": repeat}
+    settings = _settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
+    from groundstation.link import Link
+
+    with Link(settings) as link:
+        events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        if wait:
+            link.follow(on_event=events.put)
+        answer = link.request("mission", mission)
+        if not wait:
+            if as_json:
+                typer.echo(json.dumps(answer))
+            else:
+                console.print(
+                    f"accepted as {answer['mission']}, {answer['duration']:.0f} s ({answer['reason']})"
+                )
+            return
+        ended = _accompany(link, answer, events, as_json)
+        record = ""
+        if ended["record"]:
+            record = str(_fetch(link, ended["record"], output or Path(settings.flights), as_json))
+        result = {
+            "mission": answer["mission"],
+            "state": ended["state"],
+            "reason": ended["reason"],
+            "record": record,
+        }
+    if as_json:
+        typer.echo(json.dumps(result))
+    elif ended["state"] == "finished":
+        console.print(f"flown: {escape(record)}")
+    if ended["state"] != "finished":
+        kept = f" (record: {record})" if record else ""
+        raise InputError(
+            f"mission {answer['mission']} {ended['state']}: {ended['reason']}{kept}; see "
+            "`groundstation status`"
+        )
+
+
+def _mission(trajectory: str, parameters: list[str]) -> dict[str, Any]:
+    """The mission's trajectory, checked here so that a typing error needs no vehicle."""
+    from models.reference import trajectory as named
+    from models.reference import trajectory_from_csv
+
+    if trajectory.lower().endswith(".csv"):
+        try:
+            text = Path(trajectory).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{trajectory}: cannot read the setpoints ({error}); check the path") from None
+        if parameters:
+            raise InputError(f"{trajectory}: a table of setpoints has no parameters; leave --set out")
+        trajectory_from_csv(text)
+        return {"setpoints": text}
+    values: dict[str, float | str] = {}
+    for pair in parameters:
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise InputError(f"--set '{pair}': write NAME=VALUE, such as speed=2")
+        try:
+            values[key.strip()] = float(value)
+        except ValueError:
+            values[key.strip()] = value.strip()
+    named(trajectory, **values)
+    return {"trajectory": trajectory, "parameters": values}
+
+
+def _list_trajectories(as_json: bool) -> None:
+    from models.reference import KINDS
+
+    if as_json:
+        typer.echo(
+            json.dumps(
+                {
+                    k.name: {"text": k.text, "parameters": {p.name: p.default for p in k.parameters}}
+                    for k in KINDS.values()
+                },
+                indent=1,
+            )
+        )
+        return
+    from rich.table import Table
+
+    table = Table()
+    table.add_column("trajectory", no_wrap=True)
+    table.add_column("what it is")
+    table.add_column("parameters (--set NAME=VALUE)")
+    for kind in KINDS.values():
+        words = [
+            f"{p.name}={p.default:g} {p.unit}".strip()
+            if isinstance(p.default, float)
+            else f"{p.name}={p.default}"
+            for p in kind.parameters
+        ]
+        table.add_row(kind.name, escape(kind.text), escape(", ".join(words)))
+    console.print(table)
+
+
+def _accompany(
+    link: Link, answer: dict[str, Any], events: queue.SimpleQueue[Event], quiet: bool
+) -> dict[str, Any]:
+    """Print events until the mission has ended; returns its entry of the companion's status."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+        task = progress.add_task(f"{answer['mission']}: waiting", total=None)
+        silent_since: float | None = None
+        while True:
+            _print_events(events, progress.console, quiet)
+            try:
+                status = link.status()
+                silent_since = None
+            except InputError:
+                # A link may drop for a while in flight; the flight goes on without it.
+                silent_since = silent_since or time.monotonic()
+                if time.monotonic() - silent_since > 30.0:
+                    raise
+                continue
+            entry = next((m for m in status["missions"] if m["mission"] == answer["mission"]), None)
+            if entry is None:
+                raise InputError(
+                    f"companion '{link.vehicle}' knows nothing of mission {answer['mission']} any more; did "
+                    "it restart? "
+                    "Its records are still on board"
+                )
+            if entry["state"] in ENDED:
+                time.sleep(0.2)  # the event that says why is on its way
+                _print_events(events, progress.console, quiet)
+                return dict(entry)
+            phase = status["phase"] if entry["state"] == "flying" else entry["state"]
+            progress.update(
+                task,
+                description=f"{answer['mission']} {entry['trajectory']} {entry['controller']}: {phase}, "
+                f"{status['battery_voltage']:.1f} V, guard {status['guard']}",
+            )
+            time.sleep(0.3)
+
+
+def _print_events(events: queue.SimpleQueue[Event], to: Console, quiet: bool) -> None:
+    while not events.empty():
+        event = events.get()
+        if not quiet:
+            to.print(f"{event.kind}: {escape(event.text)}", style=STYLES.get(event.level, ""))
+
+
+def _fetch(link: Link, record: str, folder: Path, quiet: bool) -> Path:
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
+
+    with Progress(
+        TextColumn("fetching the record"),
+        BarColumn(),
+        DownloadColumn(),
+        console=console,
+        transient=True,
+        disable=quiet,
+    ) as progress:
+        task = progress.add_task("", total=None)
+        return link.fetch_record(
+            record, folder, lambda done, size: progress.update(task, completed=done, total=size)
+        )
+
+
+def deploy_command(
+    model: Annotated[Path, typer.Argument(help="ONNX file of `groundstation model export`.")],
+    config: ConfigOption = None,
+    name: NameOption = None,
+    connect: ConnectOption = None,
+    mode: ModeOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ZenohOption = None,
+    cfg: CfgOption = None,
+    timeout: TimeoutOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Send a model to the companion, which checks it and makes it live, or says why not."""
+    from groundstation.link import Link
+    from models.contract import model_hash
+
+    try:
+        onnx = model.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{model}: cannot read the model ({error.strerror}); `groundstation model export` makes one"
+        ) from None
+    if not onnx or onnx[:1] == b"{":
+        raise InputError(f"{model}: not an ONNX file; pass the one that `groundstation model export` wrote")
+    settings = _settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
+    with Link(settings) as link:
+        answer = link.request("model", onnx, max(settings.timeout, 30.0))
+        vehicle = link.vehicle
+    if as_json:
+        typer.echo(json.dumps({"hash": model_hash(onnx), "vehicle": vehicle, **answer}))
+        return
+    console.print(
+        f"accepted by '{vehicle}': {escape(model.name)} is live as {model_hash(onnx)}", highlight=False
+    )
+    if answer.get("reason"):
+        console.print(escape(str(answer["reason"])))
+
+
+def status_command(
+    config: ConfigOption = None,
+    name: NameOption = None,
+    connect: ConnectOption = None,
+    mode: ModeOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ZenohOption = None,
+    cfg: CfgOption = None,
+    timeout: TimeoutOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """What the companion is doing, and whether it could fly now."""
+    from groundstation.link import Link
+
+    with Link(_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)) as link:
+        status = link.status()
+        records = link.records()
+    if as_json:
+        typer.echo(json.dumps({**status, "records": records}, indent=1))
+        return
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    ready = (
+        "[green]ready to fly[/green]"
+        if status["ready"]
+        else f"[yellow]{escape(status['not_ready'])}[/yellow]"
+    )
+    rates = ", ".join(f"{key} {value:.0f} Hz" for key, value in status.get("rates", {}).items())
+    live = status.get("live") or status.get("model") or ""
+    for what, value in (
+        ("vehicle", f"{escape(status['vehicle'])}: {ready}"),
+        (
+            "phase",
+            f"{status['phase']}, {status['flight_mode'] or 'no mode'}, "
+            f"{'armed' if status['armed'] else 'disarmed'}",
+        ),
+        ("battery", f"{status['battery_voltage']:.2f} V"),
+        ("received", rates or "not measured"),
+        ("live model", escape(live if isinstance(live, str) else str(live.get("hash", live)))),
+        ("guard", escape(status["guard"])),
+        ("records", f"{len(records)} on board"),
+    ):
+        table.add_row(what, value or "none")
+    console.print(table)
+    for mission in status["missions"]:
+        reason = f" ({mission['reason']})" if mission["reason"] not in ("", mission["state"]) else ""
+        line = f"{mission['mission']} {mission['trajectory']} {mission['controller']}: "
+        f"{mission['state']}{reason}"
+        console.print(escape(line), highlight=False)
+
+
+def monitor_command(
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write a Rerun recording instead of opening the viewer.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", help="Stop after this long; default: until Ctrl-C.", min=0.1)
+    ] = None,
+    config: ConfigOption = None,
+    name: NameOption = None,
+    connect: ConnectOption = None,
+    mode: ModeOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ZenohOption = None,
+    cfg: CfgOption = None,
+    timeout: TimeoutOption = None,
+) -> None:
+    """Watch a vehicle live in Rerun: path, reference, commands, correction, guard, latency."""
+    from groundstation.link import Link
+    from groundstation.views import monitor
+
+    with Link(_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)) as link:
+        console.print(f"watching '{link.vehicle}'; Ctrl-C ends", highlight=False)
+        seen = monitor(link, save, seconds)
+    console.print(f"{seen} ticks seen" + (f", written to {escape(str(save))}" if save is not None else ""))

@@ -1,0 +1,63 @@
+"""The ground station's settings: a commented TOML file, overridden by flags."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from models.errors import InputError
+
+TEXTS = ("name", "mode", "zenoh_config", "flights")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the ground needs to find a companion.
+
+    `name` of the vehicle (empty: the only one that answers), Zenoh's `mode`, endpoints to `connect` and
+    `listen` to, a `zenoh_config` file and further `cfg` pairs `KEY:VALUE`; `timeout` in s to wait for an
+    answer; `flights` is the folder that records are fetched to.
+    """
+
+    name: str = ""
+    mode: str = "peer"
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    listen: tuple[str, ...] = ()
+    zenoh_config: str = ""
+    cfg: tuple[str, ...] = ()
+    timeout: float = 5.0
+    flights: str = "flights"
+
+
+def load_settings(path: Path | None) -> Settings:
+    """Read `groundstation.toml`; the defaults without a file. File names in it are relative to it.
+
+    Raises `InputError` for a file that cannot be read and for a key or value that does not fit.
+    """
+    if path is None:
+        return Settings()
+    from groundstation.reading.toml_file import read_toml
+
+    known = {f.name for f in fields(Settings)}
+    changes: dict[str, Any] = {}
+    for key, value in read_toml(path, "configuration").items():
+        if key not in known:
+            close = difflib.get_close_matches(key, known, 1)
+            hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(sorted(known))}"
+            raise InputError(f"{path}: unknown key '{key}'; {hint}")
+        if key == "timeout":
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.1 <= value <= 600:
+                raise InputError(f"{path}: 'timeout' must be 0.1 to 600 s, not {value!r}")
+            changes[key] = float(value)
+        elif key in TEXTS:
+            if not isinstance(value, str):
+                raise InputError(f"{path}: '{key}' must be a text, not {value!r}")
+            in_file = key in ("zenoh_config", "flights") and value
+            changes[key] = str(path.parent / value) if in_file else value
+        else:
+            if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+                raise InputError(f"{path}: '{key}' must be a list of texts, not {value!r}")
+            changes[key] = tuple(value)
+    return replace(Settings(), **changes)
