@@ -239,16 +239,20 @@ class _Search:
         )[0]
         return float(residual @ matrix @ solution)
 
-    def _contribution(self, current: _State, name: str) -> np.ndarray:
-        """What the effect at its typical size changes in the predicted specific force, (K A, P): one column each."""
+    def _contribution(self, current: _State, name: str, through: str | None = None) -> np.ndarray:
+        """What the effect at its typical size changes in the predicted specific force, (K A, P): one column each.
+
+        `through` is an effect that must act, at its typical size, for this one to act.
+        """
         values = {t.effect: dict(t.values) for t in current.fit.terms}
         effect = self.known[name]
+        if through is not None:
+            values[through] = {p.name: p.typical for p in self.known[through].parameters}
         rest = [(self.known[n], v) for n, v in values.items() if n != name]
         neutral = values.get(name, effect.neutral(self.problem.vehicle))
         base = self.problem.predict([*rest, (effect, neutral)])
-        return np.column_stack(
-            [(self.problem.predict([*rest, (effect, {**neutral, p.name: p.typical})]) - base).ravel() for p in effect.parameters]
-        )
+        moved = ({**neutral, p.name: p.typical} for p in effect.parameters)
+        return np.column_stack([(self.problem.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
 
     def _shows(self, current: _State, name: str) -> bool:
         """Whether the effect at its typical size would matter beyond the simpler effects it coincides with."""
@@ -434,6 +438,7 @@ class _Search:
         """The verdict on an effect that was not selected."""
         effect = self.known[name]
         present = {*self.base.names(), *current.added}
+        through = None
         if effect.with_any and not present & set(effect.with_any):
             through = next((n for n in effect.with_any if n in self.candidates), None)
             if through is None:
@@ -450,27 +455,23 @@ class _Search:
             estimates = self._estimates(swapped.fit, name)
             advice = f"fly this to tell it from {', '.join(stands_for)}: {effect.manoeuvre}"
             return EffectVerdict(name, "possible", None, share, p, estimates, tuple(stands_for), advice)
-        if not self._excited(extended, current, name):
+        if not self._excited(current, name, through):
             advice = f"fly this, then ask again: {effect.manoeuvre}"
             return EffectVerdict(name, "not_excited", None, share, p, estimates, (), advice)
         return EffectVerdict(name, "not_supported", None, share, p, estimates, (), "")
 
-    def _excited(self, extended: _State, current: _State, name: str) -> bool:
-        """Whether this flight would have shown the effect at its typical size."""
-        fitted, vehicle = extended.fit, self.problem.vehicle
-        columns = fitted.of(name)
-        offset = np.array(
-            [fitted.free[i].parameter.typical - fitted.free[i].parameter.neutral_for(vehicle) for i in
-            columns]
-        )
-        covariance = fitted.covariance[np.ix_(columns, columns)]
-        noncentrality = float(offset @ np.linalg.pinv(covariance, hermitian=True) @ offset)
-        contribution = fitted.jacobian[:, :, columns] @ offset
-        material = np.sqrt(np.mean(np.sum(contribution**2, axis=1))) > MATERIAL_ACCELERATION
-        threshold = stats.chi2.isf(SIGNIFICANCE, len(columns)) * (fitted.critical / 1.96) ** 2
-        power = stats.ncx2.sf(threshold, len(columns), noncentrality)
-        share = float(np.sum(contribution**2)) / current.fit.sse
-        return bool(material and power > 0.8 and share > MATERIAL_SHARE)
+    def _excited(self, current: _State, name: str, through: str | None) -> bool:
+        """Whether this flight would have shown the effect at its typical size, beside what is being fitted."""
+        mine = self._contribution(current, name, through).sum(axis=1)
+        fitted = current.fit.jacobian.reshape(self.samples, -1)
+        if fitted.shape[1]:
+            mine = mine - fitted @ np.linalg.lstsq(fitted, mine, rcond=None)[0]
+        energy = float(np.sum(mine**2))
+        material = np.sqrt(energy / len(self.problem.measured())) > MATERIAL_ACCELERATION
+        count = len(self.known[name].parameters)
+        threshold = stats.chi2.isf(SIGNIFICANCE, count) * (current.fit.critical / 1.96) ** 2
+        power = stats.ncx2.sf(threshold, count, energy / long_run_variance(self.problem, current.fit.residual))
+        return bool(material and power > 0.8 and energy > MATERIAL_SHARE * current.fit.sse)
 
     def _judge_unmeasured(self, effect: Effect) -> EffectVerdict:
         """The verdict on an effect whose measurements the flight lacks."""
