@@ -87,7 +87,7 @@ class Companion:
 
     def run(self) -> None:
         """Fly missions until `stop`; the calling thread must be the one that may block."""
-        # The control thread allocates no cycles; without this a collection of somebody else's could take 10 ms.
+        # The control thread allocates no cycles; a collection for others could stop it for 10 ms.
         gc.collect()
         gc.freeze()
         gc.disable()

@@ -83,7 +83,7 @@ class Director:
             return {"accepted": False, "reason": str(error)}
 
     def deploy(self, onnx: bytes) -> dict[str, Any]:
-        """Check a model and make it live; refused in flight, where the check would disturb the control loop."""
+        """Check a model and make it live; refused in flight: the check takes time from the control."""
         if self.flight.phase != IDLE:
             return {"accepted": False, "reason": "a flight is under way; deploy after landing"}
         answer = self.store.deploy(onnx)
@@ -154,13 +154,13 @@ class Director:
         return self.rates_too_low(self.rates)
 
     def rates_too_low(self, rates: Rates | None) -> str:
-        """'' where odometry and accelerometer arrive often enough, otherwise what is missing and what to do."""
+        """'' where odometry and accelerometer arrive often enough, otherwise what is missing."""
         if rates is None:
             return "rates have not been measured yet"
         if rates.odometry < _RATE_SHARE * self.rate:
             return (
-                f"odometry arrives at {rates.odometry:.0f} Hz, {self.rate:.0f} Hz were asked for; lower --rate, "
-                "or let the autopilot send more (PX4: EKF2_PREDICT_US, the link's MAV_x_RATE)"
+                f"odometry arrives at {rates.odometry:.0f} Hz, {self.rate:.0f} Hz were asked for; "
+                "lower --rate, or let the autopilot send more (PX4: EKF2_PREDICT_US, the link's MAV_x_RATE)"
             )
         if rates.longest_gap > self.safety.odometry_gap:
             return f"odometry had a gap of {rates.longest_gap:.2f} s; the link or this machine is too busy"

@@ -144,7 +144,7 @@ class Flight:
     # Orders
 
     def prepare(self, mission: Mission) -> None:
-        """Begin to stream idle setpoints (no thrust, no rates), which Offboard and arming need to hear first."""
+        """Begin to stream idle setpoints (no thrust, no rates), which Offboard needs to hear first."""
 
         def order() -> None:
             if self.phase == IDLE:
