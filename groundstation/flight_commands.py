@@ -68,7 +68,7 @@ def flights_command(
     from rich.table import Table
 
     table = Table(caption=f"{len(rows)} files in {directory}", caption_justify="left")
-    table.add_column("flight", overflow="fold", min_width=24)
+    table.add_column("flight", overflow="fold")
     table.add_column("date", no_wrap=True)
     for heading in ("length", "in air", "rate"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -77,7 +77,7 @@ def flights_command(
         table.add_column("flown")
     table.add_column("measured", overflow="fold")
     for row in rows:
-        cells = [escape(str(row["flight"])), row["date"][2:]]
+        cells = [escape(str(row["flight"])), row["date"]]
         if row["error"]:
             reason = str(row["error"]).removeprefix(str(directory / str(row["flight"]))).lstrip(":, ")
             cells += ["", "", "", *[""] * flown, f"[red]{escape(reason)}[/red]"]
@@ -122,7 +122,7 @@ def _flight_row(file: Path, directory: Path) -> dict[str, Any]:
     stamp = datetime.fromtimestamp(file.stat().st_mtime, UTC)
     row: dict[str, Any] = {
         "flight": str(file.relative_to(directory)),
-        "date": stamp.strftime("%Y-%m-%d %H:%M"),
+        "date": stamp.strftime("%Y-%m-%d"),
         "trajectory": "",
         "controller": "",
         "model": "",
@@ -153,7 +153,7 @@ def _record_facts(file: Path) -> dict[str, Any]:
     facts = {name: record.metadata.get(name, "") for name in ("trajectory", "controller", "model")}
     created = record.metadata.get("created_ns", "")
     if created.isdigit():
-        facts["date"] = datetime.fromtimestamp(int(created) * 1e-9, UTC).strftime("%Y-%m-%d %H:%M")
+        facts["date"] = datetime.fromtimestamp(int(created) * 1e-9, UTC).strftime("%Y-%m-%d")
     return facts
 
 
@@ -318,24 +318,22 @@ def track_command(
     from rich.table import Table
 
     table = Table(title="mean squared error against the expected linear behaviour")
-    for heading in (
-        "flight",
-        "x (m²)",
-        "y (m²)",
-        "z (m²)",
-        "roll (rad²)",
-        "pitch (rad²)",
-        "yaw (rad²)",
-        "rms (m)",
-        "change",
-    ):
-        table.add_column(
-            heading, justify="left" if heading == "flight" else "right", no_wrap=heading != "flight"
-        )
+    table.add_column("axis", no_wrap=True)
     for t in tracked:
-        row = _tracking_row(t, tracked[0])
-        change = "" if t is tracked[0] else f"{100 * row['change']:+.0f} %"
-        table.add_row(escape(t.label), *(f"{v:.2e}" for v in (*t.mse, *t.mse_zeta)), f"{t.rms:.3f}", change)
+        table.add_column(escape(t.label), justify="right", overflow="fold")
+    if len(tracked) > 1:
+        table.add_column("change", justify="right")
+    rows = [(f"{axis} (m²)", [t.mse[k] for t in tracked]) for k, axis in enumerate("xyz")]
+    rows += [
+        (f"{axis} (rad²)", [t.mse_zeta[k] for t in tracked])
+        for k, axis in enumerate(("roll", "pitch", "yaw"))
+    ]
+    rows += [("distance, rms (m)", [t.rms for t in tracked])]
+    for what, values in rows:
+        change = (
+            [f"{100 * (values[-1] / values[0] - 1):+.0f} %"] if len(tracked) > 1 and values[0] > 0 else []
+        )
+        table.add_row(what, *(f"{v:.3g}" for v in values), *change)
     console.print(table)
     if rrd is not None:
         console.print(f"Rerun recording: {escape(str(rrd))}")

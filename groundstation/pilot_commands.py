@@ -215,7 +215,9 @@ def _accompany(
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+    with Progress(
+        *columns, console=console, transient=True, disable=quiet or not console.is_terminal
+    ) as progress:
         task = progress.add_task(f"{answer['mission']}: waiting", total=None)
         silent_since: float | None = None
         while True:
@@ -265,7 +267,7 @@ def _fetch(link: Link, record: str, folder: Path, quiet: bool) -> Path:
         DownloadColumn(),
         console=console,
         transient=True,
-        disable=quiet,
+        disable=quiet or not console.is_terminal,
     ) as progress:
         task = progress.add_task("", total=None)
         return link.fetch_record(
@@ -358,9 +360,8 @@ def status_command(
     console.print(table)
     for mission in status["missions"]:
         reason = f" ({mission['reason']})" if mission["reason"] not in ("", mission["state"]) else ""
-        line = f"{mission['mission']} {mission['trajectory']} {mission['controller']}: "
-        f"{mission['state']}{reason}"
-        console.print(escape(line), highlight=False)
+        what = f"{mission['mission']} {mission['trajectory']} {mission['controller']}"
+        console.print(escape(f"{what}: {mission['state']}{reason}"), highlight=False)
 
 
 def monitor_command(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from groundstation.reading.plausible import held
 from models.errors import InputError
 from models.flight import COLUMNS, Flight
 from models.record import FlightRecord, read_record
@@ -13,6 +14,8 @@ from models.vehicle import Vehicle, load_vehicle
 
 COMMANDED = ("takeoff", "mission", "landing")
 """Phases in which the companion's own command flies the vehicle."""
+
+REFERENCES = ("position_reference", "velocity_reference", "acceleration_reference", "yaw_reference")
 
 KEPT = (
     "feedback_thrust",
@@ -40,6 +43,12 @@ def read_flight_record(path: Path, vehicle: str | Path | Vehicle | None = None) 
     columns = {name: ticks[name] for name in COLUMNS if name in ticks and not _unknown(ticks[name])}
     if "battery_voltage" in columns and not np.any(columns["battery_voltage"] > 0):
         del columns["battery_voltage"]
+    for name in ("thrust_command", "body_rate_command"):
+        if name in columns:  # no setpoint was sent there: nothing was commanded, nothing is missing
+            columns[name] = np.nan_to_num(columns[name])
+    for name in REFERENCES:
+        if name in columns:
+            columns[name] = held(columns[name])
     commanded = np.isin(ticks["phase"], COMMANDED) & ticks["armed"] & ticks["setpoint_sent"]
     extra = {name: ticks[name] for name in KEPT if name in ticks and not _unknown(ticks[name])}
     extra["mission"] = (ticks["phase"] == "mission").astype(float)

@@ -92,9 +92,7 @@ def complete(
         if not np.any(missing):
             continue
         if name in HELD and not np.all(missing):
-            rows = np.maximum.accumulate(np.where(missing, 0, np.arange(len(t))))
-            rows[: int(np.argmin(missing))] = int(np.argmin(missing))
-            out[name] = column[rows]
+            out[name] = held(column)
             notes.append(
                 f"{COLUMNS[name][2]}: the last value is held in {100 * missing.mean():.0f} % of the rows"
             )
@@ -111,6 +109,17 @@ def complete(
         notes.append(f"{int(bad.sum())} rows with missing values were left out")
         t, out = t[~bad], {name: column[~bad] for name, column in out.items()}
     return t, out, notes
+
+
+def held(column: np.ndarray) -> np.ndarray:
+    """A column (N,) or (N, k) whose missing rows hold the last value (the first one before it)."""
+    known = np.isfinite(column if column.ndim == 1 else column.sum(axis=1))
+    if not np.any(known):
+        return column
+    rows = np.maximum.accumulate(np.where(known, np.arange(len(column)), 0))
+    first = int(np.argmax(known))
+    rows[:first] = first
+    return column[rows]
 
 
 def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -> None:
