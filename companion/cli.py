@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+import threading
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import FrameType
@@ -26,6 +27,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
+
+_CLOSE_PATIENCE = 5.0  # s
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Connect = Annotated[
@@ -120,7 +123,12 @@ def run(
     try:
         companion.run()
     finally:
-        companion.close()
+        # MAVSDK waits for its callbacks; a control thread that hangs would keep us here for ever.
+        closing = threading.Thread(target=companion.close, daemon=True)
+        closing.start()
+        closing.join(_CLOSE_PATIENCE)
+        if closing.is_alive():
+            os._exit(1)
 
 
 @app.command(epilog="Example: companion check --connect udpin://127.0.0.1:14540 --json")

@@ -32,6 +32,10 @@ _STREAM_BEFORE_OFFBOARD = 0.6  # s; PX4 wants to have heard setpoints for half a
 _MODE_TIMEOUT, _ARM_TIMEOUT = 4.0, 5.0
 _LAND_RETRY, _LAND_TRIES = 1.0, 5
 _DISARM_AFTER = 3.0  # s on the ground after which we ask for what the autopilot should have done by itself
+_STALLED, _GONE = (
+    0.5,
+    10.0,
+)  # s without a tick that are told, and without any sign of the vehicle that end a flight
 _RATE_SHARE = 0.75
 _MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
 
@@ -288,6 +292,7 @@ class Director:
         """Do what the flight asks for that may block, until it is over."""
         flight, latest = self.flight, self.link.latest
         asked, tries, grounded = -math.inf, 0, math.inf
+        ticked, ticked_at, told = flight.ticked, time.monotonic(), False
         while flight.phase != IDLE:
             time.sleep(0.02)
             now = time.monotonic()
@@ -303,7 +308,12 @@ class Director:
             if now - grounded > _DISARM_AFTER and latest.armed and flight.phase == LANDING:
                 self.link.disarm()
                 grounded = math.inf
-            if now - latest.heartbeat > 10.0:
+            if flight.ticked != ticked:
+                ticked, ticked_at, told = flight.ticked, now, False
+            elif now - ticked_at > _STALLED and not told:
+                told = True
+                self.emit("error", "no_odometry", "no odometry, or the control thread hangs: nothing is sent")
+            if now - max(latest.heartbeat, ticked_at) > _GONE:
                 flight.abandon("the autopilot fell silent in flight")
 
     def _wait(self, condition: Callable[[], bool], timeout: float) -> bool:

@@ -127,6 +127,7 @@ class Flight:
     phase: str = IDLE
     wants_land: bool = False
     sent: int = 0
+    ticked: int = 0
     home: Vector = (0.0, 0.0, 0.0)
     mission: Mission | None = None
     outcome: str = ""
@@ -207,6 +208,7 @@ class Flight:
         """Decide what to send for this odometry message."""
         out = self._decide(odometry, latest)
         self._sending = out.step is not None
+        self.ticked += 1
         self.sent += self._sending
         return out
 

@@ -1,5 +1,4 @@
-"""Real processes for the companion's tests: a bridge, a companion, a wiretap between them, a ground on Zenoh.
-"""
+"""Real processes for the companion's tests: bridge, companion, a wiretap between them, a ground on Zenoh.
 
 from __future__ import annotations
 
@@ -18,11 +17,12 @@ from typing import Any
 
 import zenoh
 
+from companion.vehicle_link import mode_name
 from models import contract
 from models.record_pb2 import Event, Tick
 
 VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
-SET_ATTITUDE_TARGET, ODOMETRY = 82, 331
+HEARTBEAT, SET_ATTITUDE_TARGET, ODOMETRY = 0, 82, 331
 PATIENCE = 90.0
 """Seconds after which a test gives up waiting; nothing measured depends on it."""
 
@@ -117,13 +117,14 @@ class Bridge(Process):
 class Wiretap:
     """Stands on the UDP link between vehicle and companion and notes when which message passes.
 
-    `times[message id]` are monotonic seconds. The vehicle sends to `port`, the companion listens on
-    `companion_port`.
+    `times[message id]` are monotonic seconds; `mode` and `armed` are those of the vehicle's last heartbeat.
+    The vehicle sends to `port`, the companion listens on `companion_port`.
     """
 
     def __init__(self) -> None:
         self.port, self.companion_port = free_port(), free_port()
         self.times: dict[int, list[float]] = {SET_ATTITUDE_TARGET: [], ODOMETRY: []}
+        self.mode, self.armed = "UNKNOWN", False
         self._vehicle_side = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._vehicle_side.bind(("127.0.0.1", self.port))
         self._companion_side = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -156,6 +157,10 @@ class Wiretap:
                     number = int.from_bytes(datagram[7:10], "little")
                     if number in self.times:
                         self.times[number].append(now)
+                    elif number == HEARTBEAT and side is self._vehicle_side:
+                        payload = datagram[10 : 10 + datagram[1]].ljust(9, b"\0")
+                        self.mode = mode_name(int.from_bytes(payload[:4], "little"))
+                        self.armed = bool(payload[6] & 128)
                 try:
                     if side is self._vehicle_side:
                         vehicle = address
