@@ -223,6 +223,7 @@ def fly(
         "times_real_time": flown.times_real_time,
         "rms_error": {"x": flown.rms_error[0], "y": flown.rms_error[1], "z": flown.rms_error[2], "unit": "m"},
         "guard": flown.guard,
+        "ticks_on_ground": flown.touching,
         "sealed": str(told) if told else None,
     }
     error = ", ".join(f"{axis} {value:.3f}" for axis, value in zip("xyz", flown.rms_error, strict=True))
@@ -231,6 +232,8 @@ def fly(
         f"({flown.times_real_time:.0f} times real time); "
         f"RMS error to the reference {error} m; {_told(settings, told)}"
     )
+    if flown.touching:
+        text += f"; touched the ground in {flown.touching} of {flown.ticks} ticks"
     _tell(report, text, as_json)
 
 

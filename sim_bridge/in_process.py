@@ -78,7 +78,10 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Flown:
-    """How a flight went. Errors are RMS of position against the reference, m, per axis of the world."""
+    """How a flight went. Errors are RMS of position against the reference, m, per axis of the world.
+
+    `touching` counts the ticks at which the vehicle touched the ground, where no model of flight holds.
+    """
 
     outcome: str
     ticks: int
@@ -86,6 +89,7 @@ class Flown:
     wall: float
     rms_error: tuple[float, float, float]
     guard: str
+    touching: int = 0
 
     @property
     def times_real_time(self) -> float:
@@ -109,7 +113,7 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     simulator.start_in_hover((x, y, z + ground), yaw)
     period = steps * PHYSICS_STEP
     squares = [0.0, 0.0, 0.0]
-    ticks, outcome = 0, "finished"
+    ticks, touching, outcome = 0, 0, "finished"
     if guard is not None:
         guard.start()
     estimate, step = simulator.estimate, simulator.step
@@ -133,16 +137,18 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
         if ex * ex + ey * ey + ez * ez > _LOST * _LOST:
             outcome = "lost"
             break
-        if simulator.world.touching and pz < 0.6 * ground:
-            outcome = "crashed"
-            break
+        if simulator.world.touching:
+            touching += 1
+            if pz < 0.6 * ground:  # on its side or its back
+                outcome = "crashed"
+                break
         command = control.thrust_command
         p, q, r = control.command.body_rate
         for _ in range(steps):
             step(command, p, q, r)
     wall = time.perf_counter() - begin
     a, b, c = (math.sqrt(total / ticks) for total in squares)
-    return Flown(outcome, ticks, ticks * period, wall, (a, b, c), status)
+    return Flown(outcome, ticks, ticks * period, wall, (a, b, c), status, touching)
 
 
 def _guard(plan: Plan) -> Guard | None:

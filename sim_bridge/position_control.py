@@ -70,12 +70,12 @@ def attitude_of_thrust(force: Vector, yaw: float) -> Quaternion:
     """
     length = math.sqrt(sum(f * f for f in force))
     zx, zy, zz = (f / length for f in force)
-    # y = z cross heading, x = y cross z; thrust never points sideways enough for z and heading to align.
-    cx, cy = math.cos(yaw), math.sin(yaw)
-    yx, yy, yz = -zz * cy, zz * cx, zx * cy - zy * cx
-    norm = math.sqrt(yx * yx + yy * yy + yz * yz)
-    yx, yy, yz = yx / norm, yy / norm, yz / norm
-    xx, xy, xz = yy * zz - yz * zy, yz * zx - yx * zz, yx * zy - yy * zx
+    # x = left cross z lies in the vertical plane of the heading, so that yaw is the Z-Y-X angle; y = z cross x.
+    left_x, left_y = -math.sin(yaw), math.cos(yaw)
+    xx, xy, xz = left_y * zz, -left_x * zz, left_x * zy - left_y * zx
+    norm = math.sqrt(xx * xx + xy * xy + xz * xz)
+    xx, xy, xz = xx / norm, xy / norm, xz / norm
+    yx, yy, yz = zy * xz - zz * xy, zz * xx - zx * xz, zx * xy - zy * xx
     w = math.sqrt(max(0.0, 1 + xx + yy + zz)) / 2
     if w > 1e-3:
         return w, (yz - zy) / (4 * w), (zx - xz) / (4 * w), (xy - yx) / (4 * w)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,8 @@ from pymavlink.dialects.v20 import common as mav
 from sim_bridge.mavlink.telemetry import ESTIMATOR_STREAMS, STREAMS
 
 Address = tuple[str, int]
+
+_MAVLINK_1, _MAVLINK_2 = 0xFE, 0xFD  # first byte of a message
 
 
 @dataclass
@@ -35,9 +38,26 @@ class Peer:
         self.next_due = now
 
     def parse(self, datagram: bytes) -> list[Any]:
-        """The messages of a datagram; what is not MAVLink is skipped."""
-        messages = self.link.parse_buffer(bytearray(datagram)) or []
-        return [message for message in messages if message.get_type() != "BAD_DATA"]
+        """The messages of a datagram, which holds whole ones; what is not MAVLink is skipped.
+
+        pymavlink's own parser reads a stream: a broken datagram would make it wait for the rest in the next ones.
+        """
+        messages = []
+        begin = 0
+        while begin + 8 <= len(datagram):
+            if datagram[begin] == _MAVLINK_2:
+                length = datagram[begin + 1] + (25 if datagram[begin + 2] & mav.MAVLINK_IFLAG_SIGNED else 12)
+            elif datagram[begin] == _MAVLINK_1:
+                length = datagram[begin + 1] + 8
+            else:
+                begin += 1
+                continue
+            try:
+                messages.append(self.link.decode(bytearray(datagram[begin : begin + length])))
+                begin += length
+            except (mav.MAVError, struct.error, ValueError):
+                begin += 1
+        return messages
 
     def pack(self, message: Any) -> bytes:
         """The bytes of a message on this link."""
@@ -54,8 +74,9 @@ class Peer:
             return False
         stream = self.streams[number]
         stream.interval = _interval_of(STREAMS[number][1]) if interval == 0 else max(round(interval), 0)
-        stream.due = now
-        self.next_due = now
+        if stream.interval:
+            stream.due = _next_due(now, stream.interval)
+            self.next_due = min(self.next_due, stream.due)
         return True
 
     def interval(self, number: int) -> int:
@@ -78,12 +99,15 @@ class Peer:
                 interval = estimator_interval
             if now >= stream.due:
                 numbers.append(number)
-                stream.due += interval
-                if stream.due <= now:
-                    stream.due = now + interval
+                stream.due = _next_due(now, interval)
             soonest = min(soonest, stream.due)
         self.next_due = soonest
         return numbers
+
+
+def _next_due(now: int, interval: int) -> int:
+    """The next multiple of the interval: messages with the same rate are of the same moment."""
+    return (now // interval + 1) * interval
 
 
 def _interval_of(rate: float) -> int:
