@@ -20,12 +20,18 @@ console = Console()
 model_app = typer.Typer(no_args_is_help=True, help="Make, list, show and export model versions.")
 
 FlightArgument = Annotated[Path, typer.Argument(help="A flight: CSV, Parquet, MCAP record or PX4 ULog.")]
-VehicleOption = Annotated[Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")]
+VehicleOption = Annotated[
+    Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
+]
 MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML that maps the file's columns.")]
 ModelOption = Annotated[str | None, typer.Option("--model", help="A version number, or a model's JSON file.")]
 StoreOption = Annotated[Path, typer.Option("--store", help="Folder of the model versions.")]
-EffectsOption = Annotated[Path | None, typer.Option("--effects", help="Folder of your own effects, one file each.")]
-BandwidthOption = Annotated[float | None, typer.Option("--bandwidth", help="Low-pass for both sides, Hz.", min=0.1)]
+EffectsOption = Annotated[
+    Path | None, typer.Option("--effects", help="Folder of your own effects, one file each.")
+]
+BandwidthOption = Annotated[
+    float | None, typer.Option("--bandwidth", help="Low-pass for both sides, Hz.", min=0.1)
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 RecordingOption = Annotated[Path | None, typer.Option("--rrd", help="Write a Rerun recording here.")]
 DEFAULT_STORE = Path("trueflight-models")
@@ -61,7 +67,9 @@ def _model(which: str | None, flight: Flight, store: Path, effects: Path | None)
     directory = None if effects is None else str(effects)
     if which == "linear":
         return linear_model(flight.vehicle)
-    model = newest(store, flight.vehicle, directory) if which is None else find(store, flight.vehicle.name, which)
+    model = (
+        newest(store, flight.vehicle, directory) if which is None else find(store, flight.vehicle.name, which)
+    )
     if model is None:
         return rigid_body_model(flight.vehicle, directory)
     check_vehicle(model, flight)
@@ -78,7 +86,8 @@ def check_vehicle(model: Model, flight: Flight) -> None:
     for name in ("mass", "hover_thrust", "thrust_model"):
         if getattr(model.vehicle, name) != getattr(flight.vehicle, name):
             raise InputError(
-                f"{model.label} was made for {name} = {getattr(model.vehicle, name)}, {flight.vehicle.source or 'the flight'} "
+                f"{model.label} was made for {name} = {getattr(model.vehicle, name)}, "
+                f"{flight.vehicle.source or 'the flight'} "
                 f"says {getattr(flight.vehicle, name)}; make a new model, or pass the vehicle file it was made with"
             )
 
@@ -177,13 +186,17 @@ def where_command(
 def diagnose_command(
     flight: FlightArgument,
     vehicle: VehicleOption = None,
-    validate: Annotated[Path | None, typer.Option("--validate", help="Another flight, held out of every fit.")] = None,
+    validate: Annotated[
+        Path | None, typer.Option("--validate", help="Another flight, held out of every fit.")
+    ] = None,
     mapping: MappingOption = None,
     model: ModelOption = None,
     store: StoreOption = DEFAULT_STORE,
     effects: EffectsOption = None,
     bandwidth: BandwidthOption = None,
-    everything: Annotated[bool, typer.Option("--all", help="Parameters of every effect, found or not.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Parameters of every effect, found or not.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Which effect is missing: ranked, with parameters and intervals, checked on held-out data.
@@ -240,7 +253,8 @@ def effects_command(
                     "title": e.title,
                     "formula": " ".join((e.formula.__doc__ or "").split()),
                     "parameters": {
-                        p.name: {"unit": p.unit, "meaning": p.meaning, "low": p.low, "high": p.high} for p in e.parameters
+                        p.name: {"unit": p.unit, "meaning": p.meaning, "low": p.low, "high": p.high}
+                        for p in e.parameters
                     },
                     "needs": list(e.needs),
                     "manoeuvre": e.manoeuvre,
@@ -269,7 +283,11 @@ def effects_command(
     table.add_column("what it is")
     table.add_column("parameters")
     for e in shown:
-        table.add_row(e.name, e.title, ", ".join(p.name if p.unit == "1" else f"{p.name} ({p.unit})" for p in e.parameters))
+        table.add_row(
+            e.name,
+            e.title,
+            ", ".join(p.name if p.unit == "1" else f"{p.name} ({p.unit})" for p in e.parameters),
+        )
     console.print(table)
 
 
@@ -277,7 +295,9 @@ def effects_command(
 def model_add(
     effect: Annotated[str, typer.Argument(help="Name of the effect: groundstation effects")],
     flight: Annotated[Path, typer.Option("--flight", help="The flight to fit to.")],
-    validate: Annotated[Path | None, typer.Option("--validate", help="Another flight, to see the error fall on.")] = None,
+    validate: Annotated[
+        Path | None, typer.Option("--validate", help="Another flight, to see the error fall on.")
+    ] = None,
     vehicle: VehicleOption = None,
     mapping: MappingOption = None,
     model: ModelOption = None,
@@ -347,7 +367,9 @@ def model_list(
     from models.model import read_model
 
     if not store.is_dir():
-        raise InputError(f"{store}: no model store here; 'groundstation model add' makes one, --store DIR names another")
+        raise InputError(
+            f"{store}: no model store here; 'groundstation model add' makes one, --store DIR names another"
+        )
     names = [vehicle] if vehicle else sorted(p.name for p in store.iterdir() if p.is_dir())
     models = [read_model(path) for name in names for path in versions(store, name)]
     if as_json:
@@ -359,7 +381,12 @@ def model_list(
     for m in models:
         parent = "linear" if m.parent is None else f"v{m.parent}"
         table.add_row(
-            m.vehicle.name, f"v{m.version}", parent, ", ".join(m.names()), f"{m.fit.get('rms', 0.0):.3f}", m.created
+            m.vehicle.name,
+            f"v{m.version}",
+            parent,
+            ", ".join(m.names()),
+            f"{m.fit.get('rms', 0.0):.3f}",
+            m.created,
         )
     console.print(table)
 
@@ -367,7 +394,9 @@ def model_list(
 @model_app.command("show")
 def model_show(
     which: Annotated[str, typer.Argument(help="Version number, or the model's JSON file.")],
-    vehicle: Annotated[str, typer.Option("--vehicle-name", help="Name of the vehicle, for a version number.")] = "",
+    vehicle: Annotated[
+        str, typer.Option("--vehicle-name", help="Name of the vehicle, for a version number.")
+    ] = "",
     store: StoreOption = DEFAULT_STORE,
     as_json: JsonOption = False,
 ) -> None:
@@ -382,10 +411,14 @@ def model_show(
     if as_json:
         print_json(model_table(model))
         return
-    console.print(f"{model.label} of {model.vehicle.name}, made {model.created}, fit RMS {model.fit.get('rms', 0):.3f} m/s²")
+    console.print(
+        f"{model.label} of {model.vehicle.name}, made {model.created}, fit RMS {model.fit.get('rms', 0):.3f} m/s²"
+    )
     for term in model.terms:
         values = ", ".join(
-            f"{k} = {v:.4g} [{term.intervals[k][0]:.4g}, {term.intervals[k][1]:.4g}]" if k in term.intervals else f"{k} = {v:.4g}"
+            f"{k} = {v:.4g} [{term.intervals[k][0]:.4g}, {term.intervals[k][1]:.4g}]"
+            if k in term.intervals
+            else f"{k} = {v:.4g}"
             for k, v in term.values.items()
         )
         console.print(f"  {term.effect}  {values}", highlight=False)
@@ -394,7 +427,9 @@ def model_show(
 @model_app.command("export")
 def model_export(
     which: Annotated[str, typer.Argument(help="Version number, or the model's JSON file.")],
-    flight: Annotated[Path, typer.Option("--flight", help="Flight that gives the training range and golden vectors.")],
+    flight: Annotated[
+        Path, typer.Option("--flight", help="Flight that gives the training range and golden vectors.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The ONNX file to write.")],
     vehicle: VehicleOption = None,
     mapping: MappingOption = None,
@@ -419,11 +454,16 @@ def model_export(
     temporary.replace(output)
     left = not_exported(model)
     if as_json:
-        print_json({"path": str(output), "hash": model_hash(data), "bytes": len(data), "not_exported": list(left)})
+        print_json(
+            {"path": str(output), "hash": model_hash(data), "bytes": len(data), "not_exported": list(left)}
+        )
         return
     console.print(f"{output}: {model.label}, {len(data) / 1000:.0f} kB, hash {model_hash(data)}")
     if left:
-        console.print(f"not in it, for a static correction has no memory and no sensor: {', '.join(left)}", style="yellow")
+        console.print(
+            f"not in it, for a static correction has no memory and no sensor: {', '.join(left)}",
+            style="yellow",
+        )
 
 
 def _only_vehicle(store: Path) -> str:

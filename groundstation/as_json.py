@@ -39,7 +39,12 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
         "base": list(d.base.names()),
         "bandwidth_hz": d.bandwidth,
         "axes": ["xyz"[i] for i in d.axes],
-        "residual_rms": {"before": d.rms_before, "after": d.rms_after, "noise_floor": d.noise_floor, "unit": UNIT},
+        "residual_rms": {
+            "before": d.rms_before,
+            "after": d.rms_after,
+            "noise_floor": d.noise_floor,
+            "unit": UNIT,
+        },
         "effects": [
             {
                 "name": e.name,
@@ -48,7 +53,8 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
                 "variance_share": e.variance_share,
                 "p_value": e.p_value,
                 "parameters": {
-                    p.name: {"value": p.value, "low": p.low, "high": p.high, "unit": p.unit} for p in e.parameters
+                    p.name: {"value": p.value, "low": p.low, "high": p.high, "unit": p.unit}
+                    for p in e.parameters
                 },
                 "indistinguishable_from": list(e.indistinguishable_from),
                 "advice": e.advice,
@@ -62,12 +68,12 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
     }
     if d.validation_before is not None:
         table["validation_rms"] = {"before": d.validation_before, "after": d.validation_after, "unit": UNIT}
-    return plain(table)  # type: ignore[no-any-return]
+    return plain(table)
 
 
 def comparison_table(c: Comparison) -> dict[str, Any]:
     """The JSON of a comparison, without its time series."""
-    return plain(  # type: ignore[no-any-return]
+    return plain(
         {
             "flight": c.flight.name,
             "model": c.label,
@@ -78,7 +84,8 @@ def comparison_table(c: Comparison) -> dict[str, Any]:
             "frame": "heading",
             "share_of_samples": float(c.used.mean()),
             "axes": {
-                a.axis: {"rms": a.rms, "noise_floor": a.noise_floor, "share_explained": a.share_explained} for a in c.axes
+                a.axis: {"rms": a.rms, "noise_floor": a.noise_floor, "share_explained": a.share_explained}
+                for a in c.axes
             },
             "open_loop": [asdict(h) for h in c.horizons],
             "notes": list(c.flight.notes),
@@ -88,7 +95,7 @@ def comparison_table(c: Comparison) -> dict[str, Any]:
 
 def where_table(w: WhereItFails) -> dict[str, Any]:
     """The JSON of where a model fails."""
-    return plain(  # type: ignore[no-any-return]
+    return plain(
         {
             "regions": [asdict(r) for r in w.regions],
             "worst": [asdict(m) for m in w.worst],
@@ -100,14 +107,15 @@ def where_table(w: WhereItFails) -> dict[str, Any]:
 
 def model_table(model: Model) -> dict[str, Any]:
     """The JSON of a model version."""
-    return plain(  # type: ignore[no-any-return]
+    return plain(
         {
             "vehicle": model.vehicle.name,
             "version": model.version,
             "parent": model.parent,
             "label": model.label,
             "effects": [
-                {"name": t.effect, "parameters": dict(t.values), "intervals": dict(t.intervals)} for t in model.terms
+                {"name": t.effect, "parameters": dict(t.values), "intervals": dict(t.intervals)}
+                for t in model.terms
             ],
             "created": model.created,
             "data_hash": model.data_hash,
@@ -118,4 +126,4 @@ def model_table(model: Model) -> dict[str, Any]:
 
 def waterfall_table(steps: tuple[WaterfallStep, ...]) -> list[dict[str, Any]]:
     """The JSON of a waterfall."""
-    return plain([asdict(s) for s in steps])  # type: ignore[no-any-return]
+    return plain([asdict(s) for s in steps])

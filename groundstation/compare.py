@@ -19,7 +19,9 @@ RESTART = 0.25
 """s between two starts of an open-loop prediction."""
 
 
-def compare(flight: Flight, model: Model, bandwidth: float | None = None, horizons: bool = True) -> Comparison:
+def compare(
+    flight: Flight, model: Model, bandwidth: float | None = None, horizons: bool = True
+) -> Comparison:
     """Compare the acceleration that `model` predicts with the measured one, heading frame, same low-pass on both.
 
     Raises `InputError` where the flight lacks what a comparison needs.
@@ -34,7 +36,9 @@ def compare(flight: Flight, model: Model, bandwidth: float | None = None, horizo
     mse, mse_linear = (np.mean(r[used] ** 2, axis=0) for r in (residual, measured - linear))
     floor = _heading_noise(measurement)
     axes = tuple(
-        AxisError("xyz"[i], float(np.sqrt(mse[i])), float(floor[i]), _share(mse[i], mse_linear[i], floor[i] ** 2))
+        AxisError(
+            "xyz"[i], float(np.sqrt(mse[i])), float(floor[i]), _share(mse[i], mse_linear[i], floor[i] ** 2)
+        )
         for i in measurement.axes
     )
     chosen = list(measurement.axes)
@@ -53,7 +57,9 @@ def compare(flight: Flight, model: Model, bandwidth: float | None = None, horizo
     )
 
 
-def waterfall(fitted: Flight, held_out: Flight | None, versions: list[Model], bandwidth: float | None = None) -> tuple[WaterfallStep, ...]:
+def waterfall(
+    fitted: Flight, held_out: Flight | None, versions: list[Model], bandwidth: float | None = None
+) -> tuple[WaterfallStep, ...]:
     """Residual RMS of each model version on the fitted and on the held-out flight."""
     steps = []
     for model in versions:
@@ -115,7 +121,7 @@ def _horizons(flight: Flight, motion: Motion, chain: Chain, used: np.ndarray) ->
         at = _rows(base, k).with_(height=position[:, 2], air_velocity=heading_from_world(velocity, yaw[k]))
         return world_from_heading(acceleration(act(at, rest)), yaw[k])
 
-    position, velocity = flight.position[starts].copy(), flight.velocity[starts].copy()  # type: ignore[index]
+    position, velocity = flight.position[starts].copy(), flight.velocity[starts].copy()
     now = world_acceleration(starts, position, velocity)
     marks = {round(h / dt): h for h in HORIZONS}
     errors = []
@@ -126,8 +132,8 @@ def _horizons(flight: Flight, motion: Motion, chain: Chain, used: np.ndarray) ->
         velocity = velocity + 0.5 * dt * (now + following)
         now = following
         if step in marks:
-            p = np.sqrt(np.mean((position - flight.position[k]) ** 2, axis=0))  # type: ignore[index]
-            v = np.sqrt(np.mean((velocity - flight.velocity[k]) ** 2, axis=0))  # type: ignore[index]
+            p = np.sqrt(np.mean((position - flight.position[k]) ** 2, axis=0))
+            v = np.sqrt(np.mean((velocity - flight.velocity[k]) ** 2, axis=0))
             errors.append(HorizonError(marks[step], _three(p), _three(v), len(starts)))
     return tuple(errors)
 
@@ -144,9 +150,9 @@ def _rows(motion: Motion, k: np.ndarray) -> Motion:
         thrust=motion.thrust[k],
         force=motion.force[k],
         reading=motion.reading[k],
-        rotation=motion.rotation[k],  # type: ignore[index]
+        rotation=motion.rotation[k],
         euler=None if euler is None else (euler[0][k], euler[1][k]),
-        cos_yaw=motion.cos_yaw[k],  # type: ignore[index]
-        sin_yaw=motion.sin_yaw[k],  # type: ignore[index]
+        cos_yaw=motion.cos_yaw[k],
+        sin_yaw=motion.sin_yaw[k],
         voltage=None if motion.voltage is None else motion.voltage[k],
     )

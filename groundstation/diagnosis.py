@@ -201,7 +201,9 @@ class _Search:
             if accepted == SCREENED or promise < MATERIAL_SHARE * current.fit.sse:
                 break
             candidate = self.state((*current.added, *step))
-            if not self._acceptable(candidate, current, step) or not all(self._shows(current, n) for n in step):
+            if not self._acceptable(candidate, current, step) or not all(
+                self._shows(current, n) for n in step
+            ):
                 continue
             accepted += 1
             if best is None or self._score(candidate) < self._score(best):
@@ -264,6 +266,11 @@ class _Search:
         rest = mine - simpler @ np.linalg.lstsq(simpler, mine, rcond=None)[0]
         return bool(np.sqrt(np.sum(rest**2) / len(self.problem.measured())) > MATERIAL_ACCELERATION)
 
+    def _evident(self, with_: _State, without: _State) -> bool:
+        """Whether the evidence for `with_` pays for its further parameters (two each, as Akaike's criterion)."""
+        price = 2.0 * (len(with_.fit.free) - len(without.fit.free))
+        return self._evidence(with_.fit, without.fit) > STRONG_EVIDENCE + price
+
     def _gain(self, with_: _State, without: _State) -> float:
         """Part of the remaining squared error on held-out blocks that `with_` takes away."""
         return (without.cv_total - with_.cv_total) / with_.cv_total
@@ -275,15 +282,17 @@ class _Search:
             gain > MATERIAL_SHARE * len(step)
             and size > MATERIAL_ACCELERATION
             and all(candidate.fit.wald(n) < SIGNIFICANCE for n in step)
+            and self._evident(candidate, current)
             and all(self._plausible(candidate.fit, n) for n in candidate.added)
         )
 
     def _plausible(self, fitted: Fit, name: str) -> bool:
         """Whether each parameter's interval reaches into its physical range."""
         for i in fitted.of(name):
-            low, high = fitted.interval(i)
+            _, high = fitted.interval(i)
             p = fitted.free[i].parameter
-            if high < p.low or low > p.high or fitted.estimate[i] > p.high + 1e-9:
+            x = fitted.estimate[i]
+            if high < p.low or x > p.high + 1e-9 or (p.low != 0.0 and x < p.low - 1e-9):
                 return False
         return True
 
@@ -296,6 +305,7 @@ class _Search:
                 useful = (
                     self._gain(current, without) > MATERIAL_SHARE
                     and current.fit.wald(name) < SIGNIFICANCE
+                    and self._evident(current, without)
                     and self._plausible(current.fit, name)
                 )
                 if not useful and (weakest is None or without.cv_total < weakest.cv_total):
@@ -308,7 +318,9 @@ class _Search:
         """The state without the effect, and without those that act only through it."""
         rest = tuple(n for n in current.added if n != name)
         present = {*self.base.names(), *rest}
-        return self.state(tuple(n for n in rest if not self.known[n].with_any or present & set(self.known[n].with_any)))
+        return self.state(
+            tuple(n for n in rest if not self.known[n].with_any or present & set(self.known[n].with_any))
+        )
 
     def _agrees_with_held_out(self, current: _State) -> _State:
         """Drop effects that predict the held-out flight worse than the model without them."""
@@ -347,13 +359,15 @@ class _Search:
             needed = self.known[rival].with_any
             if rival in current.added or (needed and not present & set(needed)):
                 continue
-            if any(self.known[n].with_any and not {*present, rival} & set(self.known[n].with_any) for n in
-            rest):
+            if any(
+                self.known[n].with_any and not {*present, rival} & set(self.known[n].with_any) for n in rest
+            ):
                 continue
             other = self.state((*rest, rival))
             if not self._plausible(other.fit, rival):
                 continue
-            if self._evidence(current.fit, other.fit) < STRONG_EVIDENCE:
+            equal = self._evidence(current.fit, other.fit) < STRONG_EVIDENCE
+            if equal and self._evident(other, self._without(current, name)):
                 found.append(rival)
         return tuple(found)
 
@@ -383,8 +397,7 @@ class _Search:
                     current.fit.wald(name),
                     self._estimates(current.fit, name),
                     (*same, *effect.aliases),
-                    f"fly this to tell it from {', '.join(same)}: {effect.manoeuvre}" if same else
-                    _add(effect),
+                    f"to tell it from {', '.join(same)}, fly {effect.manoeuvre}" if same else _add(effect),
                 )
             )
         standing_in = {r: [n for n in current.added if r in rivals[n]] for r in self.candidates}
@@ -411,8 +424,10 @@ class _Search:
             bandwidth=m.bandwidth,
             axes=m.axes,
             validation_before=None if self.held_out is None else float(np.sqrt(self._before(self.held_out))),
-            validation_after=None if validation_after is None else float(np.sqrt(validation_after /
-            held_samples)), clock_shift=shift[0] - self.problem.vehicle.command_delay if shift else None,
+            validation_after=None
+            if validation_after is None
+            else float(np.sqrt(validation_after / held_samples)),
+            clock_shift=shift[0] - self.problem.vehicle.command_delay if shift else None,
             effects=tuple(verdicts),
             unexplained=unexplained(m, current.fit.residual),
             left_out=m.left_out,
@@ -432,6 +447,7 @@ class _Search:
                 fitted.free[i].parameter.unit,
             )
             for i in fitted.of(name)
+            if np.any(fitted.jacobian[:, :, i])  # an axis that the flight does not measure has no estimate
         )
 
     def _judge_absent(self, current: _State, name: str, stands_for: list[str]) -> EffectVerdict:
@@ -453,10 +469,10 @@ class _Search:
             # as a stand-in for the effect found, not beside it
             swapped = self.state(tuple(name if n == stands_for[0] else n for n in current.added))
             estimates = self._estimates(swapped.fit, name)
-            advice = f"fly this to tell it from {', '.join(stands_for)}: {effect.manoeuvre}"
+            advice = f"to tell it from {', '.join(stands_for)}, fly {effect.manoeuvre}"
             return EffectVerdict(name, "possible", None, share, p, estimates, tuple(stands_for), advice)
         if not self._excited(current, name, through):
-            advice = f"fly this, then ask again: {effect.manoeuvre}"
+            advice = f"to see it, fly {effect.manoeuvre}"
             return EffectVerdict(name, "not_excited", None, share, p, estimates, (), advice)
         return EffectVerdict(name, "not_supported", None, share, p, estimates, (), "")
 
@@ -470,7 +486,9 @@ class _Search:
         material = np.sqrt(energy / len(self.problem.measured())) > MATERIAL_ACCELERATION
         count = len(self.known[name].parameters)
         threshold = stats.chi2.isf(SIGNIFICANCE, count) * (current.fit.critical / 1.96) ** 2
-        power = stats.ncx2.sf(threshold, count, energy / long_run_variance(self.problem, current.fit.residual))
+        power = stats.ncx2.sf(
+            threshold, count, energy / long_run_variance(self.problem, current.fit.residual)
+        )
         return bool(material and power > 0.8 and energy > MATERIAL_SHARE * current.fit.sse)
 
     def _judge_unmeasured(self, effect: Effect) -> EffectVerdict:
@@ -478,10 +496,12 @@ class _Search:
         flight = self.problem.measurements[0].flight
         missing = [n for n in effect.needs if not flight.has(n)]
         through = f" and one of {', '.join(effect.with_any)} in the model" if effect.with_any else ""
-        advice = f"needs {', '.join(missing) or 'measurements'}{through}; record it, then: {effect.manoeuvre}"
+        advice = (
+            f"needs {', '.join(missing) or 'measurements'}{through}; record it, and fly {effect.manoeuvre}"
+        )
         return EffectVerdict(effect.name, "not_excited", None, 0.0, 1.0, (), (), advice)
 
 
 def _add(effect: Effect) -> str:
-    alias = f" (these data cannot tell it from {', '.join(effect.aliases)})" if effect.aliases else ""
+    alias = f"; no flight can tell it from {', '.join(effect.aliases)}" if effect.aliases else ""
     return f"add it: groundstation model add {effect.name}{alias}"

@@ -113,7 +113,9 @@ class Fit:
     @property
     def surprise(self) -> float:
         """How far the parameters are from "no effect", in squared standard deviations of the prior."""
-        return float(sum(((x - f.neutral) / f.spread) ** 2 for x, f in zip(self.estimate, self.free, strict=True)))
+        return float(
+            sum(((x - f.neutral) / f.spread) ** 2 for x, f in zip(self.estimate, self.free, strict=True))
+        )
 
     @property
     def sse(self) -> float:
@@ -146,7 +148,9 @@ class Fit:
     def _neutral(self, index: int) -> float:
         """Value without effect; for a delay the nearest that the clock's tolerance allows."""
         free = self.free[index]
-        return float(np.clip(self.estimate[index], free.neutral - free.tolerance, free.neutral + free.tolerance))
+        return float(
+            np.clip(self.estimate[index], free.neutral - free.tolerance, free.neutral + free.tolerance)
+        )
 
 
 def critical_value(duration: float) -> float:
@@ -158,12 +162,18 @@ def critical_value(duration: float) -> float:
 def free_parameters(
     effect: Effect, vehicle: Vehicle, start: Mapping[str, float] | None = None, period: float = 0.0
 ) -> list[Free]:
-    """The numbers of `effect` to fit, on a clock of `period` s. Bounds reach a little beyond the plausible range, so that data may contradict
+    """The numbers of `effect` to fit, on a clock of `period` s.
+
+    Bounds reach a little beyond the plausible range, so that data may contradict
     the effect instead of resting on its bound."""
     free = []
     for p in effect.parameters:
         neutral = p.neutral_for(vehicle)
-        margin = 0.0 if effect.stage is Stage.COMMAND or effect.name == "ground_effect" else 2.0 * abs(p.typical - neutral)
+        margin = (
+            0.0
+            if effect.stage is Stage.COMMAND or effect.name == "ground_effect"
+            else 2.0 * abs(p.typical - neutral)
+        )
         value = (start or {}).get(p.name, neutral + 0.3 * (p.typical - neutral))
         low, high = p.low - margin, p.high + margin
         tolerance = period if effect.name == "transport_delay" else 0.0
@@ -241,7 +251,9 @@ def fit(
     return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a))
 
 
-def _jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, free: Sequence[Free]) -> np.ndarray:
+def _jacobian(
+    residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, free: Sequence[Free]
+) -> np.ndarray:
     """Forward differences with steps of a hundredth of each prior's width, away from the upper bound."""
     base = residual(x)
     columns = np.empty((base.size, len(x)))
@@ -313,7 +325,9 @@ def block_errors(fit_: Fit, blocks: np.ndarray) -> np.ndarray:
     for b in range(count):
         rest = total - gram[b]
         # residual(x + d) is about residual + J d
-        step = -np.linalg.lstsq(rest[:p, :p] + 1e-9 * np.diag(np.diag(rest[:p, :p]) + 1e-12), rest[:p, p], rcond=None)[0]
+        step = -np.linalg.lstsq(
+            rest[:p, :p] + 1e-9 * np.diag(np.diag(rest[:p, :p]) + 1e-12), rest[:p, p], rcond=None
+        )[0]
         step = np.clip(step, bounds_low, bounds_high)
         errors[b] = gram[b, p, p] + 2 * step @ gram[b, :p, p] + step @ gram[b, :p, :p] @ step
     return errors

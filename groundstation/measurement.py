@@ -170,4 +170,3 @@ def _noise(raw: np.ndarray, used: np.ndarray, sos: np.ndarray, fs: float, differ
     if differentiate:
         gain = gain * np.sin(2 * np.pi * w / fs) * fs
     return sigma * float(np.sqrt(np.mean(gain**2)))
-

@@ -55,8 +55,11 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
             without = features[:, [o is None or v not in o for o in owners]]
             losses.append((_held_out_error(without, residual, block) - (total - explained), name))
         losses.sort(reverse=True)
-        where = [f"{name} ({loss / total:.0%} of the remaining error goes with it)" for loss, name in
-        losses[:3] if loss > 0]
+        where = [
+            f"{name} ({loss / total:.0%} of the remaining error goes with it)"
+            for loss, name in losses[:3]
+            if loss > 0
+        ]
     return Unexplained(bool(found), float(share), tuple(where))
 
 

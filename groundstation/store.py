@@ -61,7 +61,9 @@ def save(store: Path, model: Model, parent: Model | None) -> tuple[Model, Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: cannot make the model store ({error.strerror}); pass --store DIR") from None
+        raise InputError(
+            f"{folder}: cannot make the model store ({error.strerror}); pass --store DIR"
+        ) from None
     files = versions(store, model.vehicle.name)
     number = 1 + max((read_model(f).version for f in files[-1:]), default=0)
     stamped = replace(
@@ -90,7 +92,11 @@ def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: f
     for flight in flights:
         for column in known.needs:
             flight.column(column)
-    terms = base.terms if "rigid_body" in base.names() or effect == "rigid_body" else (Term("rigid_body", {}), *base.terms)
+    terms = (
+        base.terms
+        if "rigid_body" in base.names() or effect == "rigid_body"
+        else (Term("rigid_body", {}), *base.terms)
+    )
     return refit(base.with_terms((*terms, Term(effect, {}))), flights, bandwidth)
 
 
@@ -101,5 +107,3 @@ def refit(model: Model, flights: Sequence[Flight], bandwidth: float | None = Non
     rms = float((fitted.sse / fitted.residual.size) ** 0.5)
     hashes = "+".join(f.data_hash for f in flights)
     return replace(model_of(fitted, model), data_hash=hashes, fit={"rms": rms})
-
-

@@ -83,21 +83,27 @@ def print_where(console: Console, where: WhereItFails) -> None:
 
 def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) -> None:
     """The ranking of effects, and the residual before and after."""
-    table = Table(title=f"{d.flight.name}: which effect is missing", title_justify="left")
-    table.add_column("effect", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
-    table.add_column("share of\nerror", justify="right")
-    table.add_column("parameters, 95 % interval")
-    for e in d.effects:
-        if e.verdict == "included" and not everything:
-            continue
-        table.add_row(
-            e.name,
-            Text(SAID[e.verdict], style=VERDICT_STYLE[e.verdict]),
-            percent(e.variance_share) if e.rank else "",
-            _parameters(e) if e.verdict in ("missing", "possible") or everything else Text(_shown(e), style="dim"),
+    shown = [e for e in d.effects if everything or e.verdict in ("missing", "possible")]
+    if shown:
+        table = Table(title=f"{d.flight.name}: which effect is missing", title_justify="left")
+        table.add_column("effect", no_wrap=True)
+        table.add_column("verdict", no_wrap=True)
+        table.add_column("share of\nerror", justify="right")
+        table.add_column("parameters, 95 % interval", no_wrap=True)
+        table.add_column("not told from")
+        for e in shown:
+            table.add_row(
+                e.name,
+                Text(SAID[e.verdict], style=VERDICT_STYLE[e.verdict]),
+                percent(e.variance_share) if e.rank else "",
+                _parameters(e),
+                ", ".join(e.indistinguishable_from),
+            )
+        console.print(table)
+    else:
+        console.print(
+            Text(f"{d.flight.name}: nothing is missing that this flight could show", style="bold green")
         )
-    console.print(table)
     line = f"residual {d.rms_before:.3f} -> {d.rms_after:.3f} m/s² (noise floor {d.noise_floor:.3f})"
     if d.validation_before is not None and d.validation_after is not None:
         line += f"; held-out flight {d.validation_before:.3f} -> {d.validation_after:.3f} m/s²"
@@ -108,26 +114,29 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
             f"effect: {'; '.join(d.unexplained.where)}",
             style="yellow",
         )
+    if absent := d.named("not_supported"):
+        console.print(f"[dim]Looked for and not there:[/dim] {', '.join(absent)}", highlight=False)
     for e in d.effects:
-        if e.verdict in ("missing", "possible"):
-            console.print(f"{e.name}: {e.advice}")
+        if e.verdict == "missing":
+            console.print(f"[bold]{e.name}[/bold]: {e.advice}", highlight=False)
+    for e in d.effects:
+        if e.verdict in ("possible", "not_excited") and e.advice:
+            console.print(f"[dim]{SAID[e.verdict]}[/dim] {e.name}: {e.advice}", highlight=False)
 
 
 def _parameters(e: EffectVerdict) -> str:
-    return "\n".join(f"{p.name} = {p.value:.3g} {_unit(p.unit)}  [{p.low:.3g}, {p.high:.3g}]" for p in e.parameters)
+    return "\n".join(
+        f"{p.name} = {p.value:.3g} {_unit(p.unit)}  [{p.low:.3g}, {p.high:.3g}]" for p in e.parameters
+    )
 
 
 def _unit(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
-def _shown(e: EffectVerdict) -> str:
-    if e.verdict == "not_excited":
-        return e.advice
-    return ", ".join(f"{p.name} within [{p.low:.3g}, {p.high:.3g}] {_unit(p.unit)}".strip() for p in e.parameters)
-
-
-def print_waterfall(console: Console, steps: Sequence[WaterfallStep], fitted: str, held_out: str | None) -> None:
+def print_waterfall(
+    console: Console, steps: Sequence[WaterfallStep], fitted: str, held_out: str | None
+) -> None:
     """The error falling over the model versions, with bars."""
     table = Table(title="residual RMS in m/s² as effects are added", title_justify="left")
     table.add_column("model")

@@ -23,9 +23,13 @@ def where_it_fails(comparison: Comparison) -> WhereItFails:
     error = np.nansum(comparison.residual**2, axis=1)
     variables = _variables(flight)
     maps = tuple(_map(name, unit, x[used], error[used]) for name, unit, x, _ in variables)
-    regions = [r for name, unit, x, words in variables if (r := _region(name, unit, x[used], error[used], words))]
+    regions = [
+        r for name, unit, x, words in variables if (r := _region(name, unit, x[used], error[used], words))
+    ]
     regions.sort(key=lambda r: r.share_of_time - r.share_of_error)
-    return WhereItFails(maps, tuple(regions), _worst(comparison, error, variables), _place(flight, used, error))
+    return WhereItFails(
+        maps, tuple(regions), _worst(comparison, error, variables), _place(flight, used, error)
+    )
 
 
 Variable = tuple[str, str, np.ndarray, tuple[str, str]]
@@ -39,7 +43,9 @@ def _variables(flight: Flight) -> list[Variable]:
     if flight.velocity is not None:
         speed = np.linalg.norm(flight.velocity[:, :2], axis=1)
         out.append(("horizontal speed", "m/s", speed, ("slower than", "faster than")))
-        out.append(("climb speed", "m/s", flight.velocity[:, 2], ("sinking or climbing below", "climbing above")))
+        out.append(
+            ("climb speed", "m/s", flight.velocity[:, 2], ("sinking or climbing below", "climbing above"))
+        )
     if flight.quaternion is not None:
         up = np.clip(rotation_matrix(flight.quaternion)[:, 2, 2], -1.0, 1.0)
         out.append(("tilt", "deg", np.degrees(np.arccos(up)), ("at tilts below", "at tilts above")))
@@ -92,7 +98,9 @@ def _number(value: float, unit: str) -> str:
     return f"{value:.2g} {unit}".strip() if unit != "1" else f"{value:.2g} of hover"
 
 
-def _worst(comparison: Comparison, error: np.ndarray, variables: list[Variable], most: int = 5) -> tuple[Moment, ...]:
+def _worst(
+    comparison: Comparison, error: np.ndarray, variables: list[Variable], most: int = 5
+) -> tuple[Moment, ...]:
     """The worst stretches of `MOMENT` s that do not overlap."""
     flight, used = comparison.flight, comparison.used
     width = max(2, round(MOMENT / flight.dt))
@@ -106,7 +114,9 @@ def _worst(comparison: Comparison, error: np.ndarray, variables: list[Variable],
             break
         part = slice(k, k + width)
         told = ", ".join(
-            f"{name} {_number(float(np.mean(x[part])), unit)}" for name, unit, x, _ in variables if name != "time"
+            f"{name} {_number(float(np.mean(x[part])), unit)}"
+            for name, unit, x, _ in variables
+            if name != "time"
         )
         start, end = float(flight.t[k]), float(flight.t[min(k + width, len(flight) - 1)])
         moments.append(Moment(start, end, float(np.sqrt(score[k] / len(comparison.axes))), told))
@@ -117,7 +127,11 @@ def _worst(comparison: Comparison, error: np.ndarray, variables: list[Variable],
 def _place(flight: Flight, used: np.ndarray, error: np.ndarray) -> PlaceMap | None:
     if flight.position is None:
         return None
-    cells, number = np.unique(np.floor(flight.position[used, :2] / CELL).astype(int), axis=0, return_inverse=True)
+    cells, number = np.unique(
+        np.floor(flight.position[used, :2] / CELL).astype(int), axis=0, return_inverse=True
+    )
     count = np.bincount(number.ravel())
     total = np.bincount(number.ravel(), weights=error[used])
-    return PlaceMap(CELL, (cells + 0.5) * CELL, np.sqrt(total / count), total / total.sum(), count / count.sum())
+    return PlaceMap(
+        CELL, (cells + 0.5) * CELL, np.sqrt(total / count), total / total.sum(), count / count.sum()
+    )

@@ -48,14 +48,14 @@ class Motion:
     thrust: Array
     force: Array
     reading: Array
-    thrust_acceleration: Array | None = None
-    rotation: Array | None = None
-    euler: tuple[Array, Array] | None = None
-    air_velocity: Array | None = None
-    cos_yaw: Array | None = None
-    sin_yaw: Array | None = None
-    height: Array | None = None
-    voltage: Array | None = None
+    thrust_acceleration: Array = None
+    rotation: Array = None
+    euler: Array = None
+    air_velocity: Array = None
+    cos_yaw: Array = None
+    sin_yaw: Array = None
+    height: Array = None
+    voltage: Array = None
     tau: float = 0.0
     delay: float = 0.0
 
@@ -92,8 +92,9 @@ class Effect:
 
     `needs` names the columns of `models.flight.COLUMNS` it reads; `with_any` the effects of which one must be in the
     model for this one to act (wind acts through drag); `exports` is False for an effect with memory, which a static
-    correction cannot hold. `beyond` names simpler effects with which this one coincides unless the flight varies what it
-    depends on (a bent thrust curve in a hover is a thrust gain). `aliases` are physical quantities that no flight can tell apart from this effect.
+    correction cannot hold. `beyond` names simpler effects with which this one coincides unless the flight
+    varies what it depends on (a bent thrust curve in a hover is a thrust gain). `aliases` are physical quantities
+    that no flight can tell apart from this effect.
     """
 
     name: str
@@ -117,5 +118,3 @@ class Effect:
     def neutral(self, vehicle: Vehicle) -> dict[str, float]:
         """Parameter values at which the effect does nothing."""
         return {p.name: p.neutral_for(vehicle) for p in self.parameters}
-
-

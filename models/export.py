@@ -36,7 +36,7 @@ class Correction(torch.nn.Module):
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Error acceleration of each row."""
         columns = {name: features[:, i] for i, name in enumerate(self.names)}
-        return error_acceleration(motion_of_features(columns, self.vehicle), self.chain)  # type: ignore[no-any-return]
+        return error_acceleration(motion_of_features(columns, self.vehicle), self.chain)
 
 
 def not_exported(model: Model) -> tuple[str, ...]:
@@ -62,11 +62,20 @@ def export_onnx(model: Model, flight: Flight) -> bytes:
         contract.KEY_NAME: model.name or model.label,
         contract.KEY_VERSION: str(model.version),
         contract.KEY_VEHICLE: json.dumps(
-            {"name": model.vehicle.name, "mass": model.vehicle.mass, "hover_thrust": model.vehicle.hover_thrust}
+            {
+                "name": model.vehicle.name,
+                "mass": model.vehicle.mass,
+                "hover_thrust": model.vehicle.hover_thrust,
+            }
         ),
         contract.KEY_FEATURES: json.dumps(
             [
-                {"name": n, "unit": units[n], "low": float(table[:, i].min()), "high": float(table[:, i].max())}
+                {
+                    "name": n,
+                    "unit": units[n],
+                    "low": float(table[:, i].min()),
+                    "high": float(table[:, i].max()),
+                }
                 for i, n in enumerate(names)
             ]
         ),

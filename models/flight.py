@@ -73,8 +73,7 @@ class Flight:
     w, x, y, z body to world, SI units. `flying` (N,) bool marks the samples to analyse (in the air, under the
     recorded commands). `accelerometer` is False where `specific_force` was differentiated from the trajectory;
     `bandwidth` is then its bandwidth in Hz, otherwise None. `origin` is the file, `data_hash` its SHA-256.
-    `notes` tells what the reader had to do (resampling, gaps, cut takeoff). `expected_position`, `expected_velocity` are
-    not part of a flight: they are computed from references and design.
+    `notes` tells what the reader had to do (resampling, gaps, cut takeoff).
     """
 
     name: str
@@ -134,7 +133,7 @@ class Flight:
                 f"{self.origin or self.name}: {what} is missing; add the columns {', '.join(names)} ({unit}) "
                 "or map yours to them with --mapping"
             )
-        return value  # type: ignore[no-any-return]
+        return value
 
     def part(self, where: slice | np.ndarray) -> Flight:
         """The flight restricted to some of its samples (a slice or a boolean mask (N,))."""

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def delayed(signal: np.ndarray, delay: float, dt: float) -> np.ndarray:
-    """`signal(t - delay)` on the samples' own clock of period `dt` (s), (N,); the first value holds before the start."""
+    """`signal(t - delay)` (N,) on the samples' own clock of period `dt` s; the first value holds before the start."""
     n = np.arange(len(signal), dtype=float)
     return np.interp(n - delay / dt, n, signal)
 

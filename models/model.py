@@ -88,7 +88,9 @@ def read_model(path: Path) -> Model:
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{path}: cannot read the model ({error.strerror}); list what is there with 'model list'") from None
+        raise InputError(
+            f"{path}: cannot read the model ({error.strerror}); list what is there with 'model list'"
+        ) from None
     except ValueError as error:
         raise InputError(f"{path}: not a model file: {error}; restore it from a copy") from None
     if not isinstance(table, dict) or table.pop("trueflight_model", None) != 1:
@@ -108,5 +110,7 @@ def read_model(path: Path) -> Model:
             raise InputError(f"{path}: unknown effect '{term.effect}'; pass --effects DIR with its file")
         missing = {p.name for p in known[term.effect].parameters} - set(term.values)
         if missing:
-            raise InputError(f"{path}: effect '{term.effect}' lacks the parameter {', '.join(sorted(missing))}")
+            raise InputError(
+                f"{path}: effect '{term.effect}' lacks the parameter {', '.join(sorted(missing))}"
+            )
     return model

@@ -98,7 +98,9 @@ def act(motion: Motion, chain: Chain) -> Motion:
         motion = effect.apply(motion, values)
     if motion.euler is not None:
         motion = motion.with_(thrust_acceleration=linear_thrust(motion))
-    for stage in (Stage.ROTATION, Stage.AIR, Stage.FORCE, Stage.SENSOR):
+    stages = (Stage.ROTATION, Stage.AIR, Stage.FORCE, Stage.SENSOR)
+    # without attitude there is nothing to rotate: thrust is compared along the body's axis
+    for stage in stages if motion.euler is not None else stages[1:]:
         for effect, values in at[stage]:
             motion = effect.apply(motion, values)
     return motion
@@ -115,8 +117,11 @@ def linear_thrust(motion: Motion) -> Array:
     """What the hover linearisation makes of the thrust: heading-frame acceleration plus gravity, (N, 3), m/s²."""
     assert motion.euler is not None
     xp = array_namespace(motion.thrust)
-    acceleration = hover_acceleration(*motion.euler, motion.thrust)
-    return acceleration + xp.stack([0.0 * motion.thrust, 0.0 * motion.thrust, 0.0 * motion.thrust + GRAVITY], axis=-1)
+    phi, theta = motion.euler
+    acceleration = hover_acceleration(phi, theta, motion.thrust)
+    return acceleration + xp.stack(
+        [0.0 * motion.thrust, 0.0 * motion.thrust, 0.0 * motion.thrust + GRAVITY], axis=-1
+    )
 
 
 def to_heading(motion: Motion, body: Array) -> Array:

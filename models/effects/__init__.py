@@ -29,7 +29,9 @@ def catalogue(directory: str | None = None) -> dict[str, Effect]:
     if directory is not None:
         folder = Path(directory)
         if not folder.is_dir():
-            raise InputError(f"{directory}: no such folder of effects; pass --effects DIR with *.py files in it")
+            raise InputError(
+                f"{directory}: no such folder of effects; pass --effects DIR with *.py files in it"
+            )
         for path in sorted(folder.glob("*.py")):
             _add(found, _load(path), str(path))
     return found

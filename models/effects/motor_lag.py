@@ -15,7 +15,9 @@ EFFECT = Effect(
     title="thrust lags its command (rotor speed dynamics)",
     stage=Stage.COMMAND,
     formula=formula,
-    parameters=(Parameter("tau", "s", "time constant of rotor speed", "motor_time_constant", 0.05, 0.0, 0.4),),
+    parameters=(
+        Parameter("tau", "s", "time constant of rotor speed", "motor_time_constant", 0.05, 0.0, 0.4),
+    ),
     needs=("thrust_command",),
     manoeuvre="quick vertical steps: thrust changes within a few hundredths of a second",
     citation="brushless motor and rotor as a first-order system in rotor speed (Bangura & Mahony 2014; Faessler 2017)",

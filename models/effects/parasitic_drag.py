@@ -10,7 +10,9 @@ def formula(motion: Motion, *, x: Array, y: Array, z: Array) -> Motion:
     xp = array_namespace(motion.thrust)
     velocity = xp.sum(motion.rotation * motion.air_velocity[:, :, None], axis=1)
     speed = xp.sqrt(xp.sum(velocity * velocity, axis=-1) + 1e-12)
-    force = xp.stack([-x * velocity[:, 0] * speed, -y * velocity[:, 1] * speed, -z * velocity[:, 2] * speed], axis=-1)
+    force = xp.stack(
+        [-x * velocity[:, 0] * speed, -y * velocity[:, 1] * speed, -z * velocity[:, 2] * speed], axis=-1
+    )
     return motion.with_(force=motion.force + force)
 
 

@@ -7,7 +7,7 @@ from models.vehicle import GRAVITY
 
 
 def formula(motion: Motion, *, x: Array, y: Array) -> Motion:
-    """`a = -diag(x, y, 0) v_air sqrt(T / m g)`, body axes: H-force and induced drag go with rotor speed times airspeed.
+    """`a = -diag(x, y, 0) v_air sqrt(T / m g)`, body axes: H-force goes with rotor speed times airspeed.
 
     `x`, `y` in 1/s are the values at hover thrust.
     """
@@ -32,6 +32,6 @@ EFFECT = Effect(
     ),
     needs=("quaternion", "velocity", "thrust_command"),
     manoeuvre="translations along body x and along body y at 1 to 4 m/s, there and back",
-    citation="Mahony, Kumar, Corke 2012; Faessler, Franchi, Scaramuzza 2018; Kai et al. 2017 (drag over sqrt of thrust)",
+    citation="Mahony, Kumar, Corke 2012; Faessler, Franchi, Scaramuzza 2018; Kai et al. 2017",
     confounded_with=("parasitic_drag", "wind", "accelerometer_bias"),
 )

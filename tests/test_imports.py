@@ -1,0 +1,68 @@
+"""Who may import what: the rules that keep the companion light and the simulator's truth its own."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+STANDARD = sys.stdlib_module_names
+EVERYWHERE = {"numpy", "typer", "rich", "models"}
+
+ALLOWED = {
+    "models": {"array_api_compat", "mcap", "google"},
+    "companion": {"companion", "mavsdk", "zenoh", "onnxruntime", "mcap", "google"},
+    "groundstation": {
+        "groundstation", "torch", "control", "scipy", "statsmodels", "rerun", "pyarrow", "pyulog", "onnx",
+        "onnxruntime", "mcap", "google", "zenoh",
+    },
+    "sim_bridge": {"sim_bridge", "companion", "mujoco", "pymavlink", "scipy", "mcap", "google", "onnxruntime"},
+}  # fmt: skip
+FITS_OR_EXPORTS = {"models/export.py": {"torch", "onnx"}}
+"""The modules of models/ that may import torch: they fit, train or export, on the ground."""
+
+
+def imports(path: Path) -> set[str]:
+    """Full names of the modules that a file imports, at any depth of its code."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import; name the package"
+            found |= {node.module or ""} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize("package", sorted(ALLOWED))
+def test_a_package_imports_only_what_its_role_allows(package: str) -> None:
+    for path in sorted((ROOT / package).rglob("*.py")):
+        if path.name == "record_pb2.py":
+            continue
+        allowed = EVERYWHERE | ALLOWED[package] | FITS_OR_EXPORTS.get(path.relative_to(ROOT).as_posix(), set())
+        foreign = {name.split(".")[0] for name in imports(path)} - STANDARD - allowed
+        assert not foreign, f"{path.relative_to(ROOT)} imports {sorted(foreign)}"
+
+
+@pytest.mark.parametrize("package", ["sim_bridge", "companion"])
+def test_neither_simulator_nor_companion_sees_the_effects(package: str) -> None:
+    forbidden = ("models.effect", "models.effects", "models.model", "models.prediction", "models.export")
+    for path in sorted((ROOT / package).rglob("*.py")):
+        seen = {name for name in imports(path) if name.startswith(forbidden)}
+        assert not seen, f"{path.relative_to(ROOT)} imports {sorted(seen)}"
+
+
+def test_groundstation_never_imports_the_simulator() -> None:
+    for path in sorted((ROOT / "groundstation").rglob("*.py")):
+        assert not any(n.startswith("sim_bridge") for n in imports(path)), path
+
+
+@pytest.mark.parametrize("module", ["companion.cli", "companion.flight", "sim_bridge.cli"])
+def test_a_light_process_loads_no_heavy_library(module: str) -> None:
+    import subprocess
+
+    heavy = {"torch", "scipy", "control", "rerun", "pyarrow", "matplotlib", "pandas"}
+    code = f"import sys, {module}; print(sorted({heavy!r} & set(sys.modules)))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert out.stdout.strip() == "[]"
