@@ -1,0 +1,205 @@
+"""Each effect against plain vector algebra, one sample at a time, and the rules that every effect keeps."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.effect import Effect, Motion
+from models.effects import catalogue, effect_named
+from models.errors import InputError
+from models.flight import Flight
+from models.frames import quaternion_from_euler
+from models.prediction import act, motion_of_flight, specific_force
+from models.vehicle import GRAVITY, Vehicle
+
+VEHICLE = Vehicle(
+    name="test",
+    mass=0.9,
+    hover_thrust=0.4,
+    rotor_radius=0.1,
+    rotor_positions=((0.12, -0.12, 0.02), (-0.12, 0.12, 0.02), (0.12, 0.12, 0.02), (-0.12, -0.12, 0.02)),
+    rotor_directions=(1, 1, -1, -1),
+)
+angle = st.floats(-0.8, 0.8)
+yaw = st.floats(-3.1, 3.1)
+speed = st.floats(-6, 6)
+command = st.floats(0.1, 0.9)
+height = st.floats(0.3, 3.0)
+voltage = st.floats(13.0, 17.0)
+
+
+def rotation(phi: float, theta: float, psi: float) -> np.ndarray:
+    """Body to world, as the product of three elementary rotations."""
+    cx, sx, cy, sy, cz, sz = (f(a) for a in (phi, theta, psi) for f in (math.cos, math.sin))
+    rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return rz @ ry @ rx
+
+
+def sample(phi: float, theta: float, psi: float, v: tuple, u: float, z: float, volts: float) -> Flight:
+    """Three equal samples in those conditions."""
+    n = 3
+    return Flight(
+        "one",
+        VEHICLE,
+        np.arange(n) * 0.01,
+        position=np.tile([0.0, 0.0, z], (n, 1)),
+        velocity=np.tile(v, (n, 1)),
+        quaternion=np.tile(quaternion_from_euler(np.array([phi, theta, psi])), (n, 1)),
+        specific_force=np.zeros((n, 3)),
+        thrust_command=np.full(n, u),
+        battery_voltage=np.full(n, volts),
+    )
+
+
+def reading(flight: Flight, *chain: tuple[str, dict[str, float]]) -> np.ndarray:
+    """Specific force that the chain predicts for the middle sample, body axes."""
+    effects = [(effect_named(name), values) for name, values in (("rigid_body", {}), *chain)]
+    return specific_force(act(motion_of_flight(flight), effects))[1]
+
+
+def drag_linear(r: np.ndarray, v: np.ndarray, t: float, p: dict) -> np.ndarray:
+    b = r.T @ v
+    return np.array([0, 0, t]) - math.sqrt(t / GRAVITY) * np.array([p["x"] * b[0], p["y"] * b[1], 0.0])
+
+
+def drag_quadratic(r: np.ndarray, v: np.ndarray, t: float, p: dict) -> np.ndarray:
+    b = r.T @ v
+    return np.array([0, 0, t]) - np.array([p["x"], p["y"], p["z"]]) * b * np.linalg.norm(b)
+
+
+def near_ground(r: np.ndarray, v: np.ndarray, t: float, p: dict, z: float) -> np.ndarray:
+    factors = []
+    for arm in VEHICLE.rotor_positions:
+        h = z + (r @ np.array(arm))[2]
+        factors.append(1.0 / (1.0 - min(0.6, (p["rho"] * VEHICLE.rotor_radius / (4.0 * h)) ** 2)))
+    return np.array([0, 0, t * np.mean(factors)])
+
+
+# effect -> the same physics written out for one sample: (R, v, specific thrust, parameters, height, volts)
+PLAIN: dict[str, Callable[..., np.ndarray]] = {
+    "thrust_gain": lambda r, v, t, p, z, volts: np.array([0, 0, t * p["gain"]]),
+    "thrust_curve": lambda r, v, t, p, z, volts: np.array([0, 0, t + p["curvature"] * t * (t - GRAVITY) / GRAVITY]),
+    "battery_sag": lambda r, v, t, p, z, volts: np.array([0, 0, t * (volts / 16.0) ** p["exponent"]]),
+    "ground_effect": lambda r, v, t, p, z, volts: near_ground(r, v, t, p, z),
+    "rotor_drag": lambda r, v, t, p, z, volts: drag_linear(r, v, t, p),
+    "parasitic_drag": lambda r, v, t, p, z, volts: drag_quadratic(r, v, t, p),
+    "accelerometer_bias": lambda r, v, t, p, z, volts: np.array([p["x"], p["y"], t + p["z"]]),
+    "rigid_body": lambda r, v, t, p, z, volts: np.array([0, 0, t]),
+}
+
+
+@pytest.mark.parametrize("name", sorted(PLAIN))
+@settings(max_examples=40, deadline=None)
+@given(angle, angle, yaw, speed, speed, speed, command, height, voltage, st.data())
+def test_effect_is_plain_vector_algebra(name, phi, theta, psi, vx, vy, vz, u, z, volts, data) -> None:
+    effect = effect_named(name)
+    values = {p.name: data.draw(st.floats(max(p.low, -5), min(p.high, 5))) for p in effect.parameters}
+    flight = sample(phi, theta, psi, (vx, vy, vz), u, z, volts)
+    chain = () if name == "rigid_body" else ((name, values),)
+    expected = PLAIN[name](
+        rotation(phi, theta, psi), np.array([vx, vy, vz]), GRAVITY * u / VEHICLE.hover_thrust, values, z, volts
+    )
+    np.testing.assert_allclose(reading(flight, *chain), expected, atol=1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(angle, angle, yaw, speed, speed, command, speed, speed)
+def test_wind_is_velocity_taken_from_the_vehicle(phi, theta, psi, vx, vy, u, wx, wy) -> None:
+    drag = ("rotor_drag", {"x": 0.2, "y": 0.3})
+    in_wind = reading(sample(phi, theta, psi, (vx, vy, 0.0), u, 1.0, 16.0), ("wind", {"x": wx, "y": wy}), drag)
+    in_still_air = reading(sample(phi, theta, psi, (vx - wx, vy - wy, 0.0), u, 1.0, 16.0), drag)
+    np.testing.assert_allclose(in_wind, in_still_air, atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(angle, angle, yaw, speed, speed, speed)
+def test_drag_never_feeds_energy(phi, theta, psi, vx, vy, vz) -> None:
+    flight = sample(phi, theta, psi, (vx, vy, vz), 0.4, 1.0, 16.0)
+    still = reading(flight)
+    for name, values in (("rotor_drag", {"x": 0.2, "y": 0.3}), ("parasitic_drag", {"x": 0.1, "y": 0.2, "z": 0.3})):
+        force = rotation(phi, theta, psi) @ (reading(flight, (name, values)) - still)
+        assert force @ np.array([vx, vy, vz]) <= 1e-9
+
+
+def step_response(**chain: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    n, dt = 200, 0.005
+    flight = Flight(
+        "step",
+        VEHICLE,
+        np.arange(n) * dt,
+        quaternion=np.tile([1.0, 0, 0, 0], (n, 1)),
+        thrust_command=np.where(np.arange(n) < 50, 0.4, 0.6),
+    )
+    effects = [(effect_named("rigid_body"), {}), *((effect_named(k), v) for k, v in chain.items())]
+    return flight.t, specific_force(act(motion_of_flight(flight), effects))[:, 2]
+
+
+def test_motor_lag_is_a_first_order_response_of_rotor_speed() -> None:
+    t, force = step_response(motor_lag={"tau": 0.05})
+    low, high = math.sqrt(GRAVITY), math.sqrt(1.5 * GRAVITY)
+    # the command ramps between two samples, so the step sits in the middle of that period
+    since = t - (t[50] - 0.5 * 0.005)
+    expected = np.where(since > 0.005, (high + (low - high) * np.exp(-since / 0.05)) ** 2, np.nan)
+    np.testing.assert_allclose(force[52:], expected[52:], rtol=2e-3)
+    np.testing.assert_allclose(force[:50], GRAVITY, rtol=1e-6)
+
+
+def test_transport_delay_shifts_the_thrust_in_time() -> None:
+    _, now = step_response()
+    _, later = step_response(transport_delay={"delay": 0.035})
+    np.testing.assert_allclose(later[7:], now[:-7], rtol=1e-9)
+
+
+@pytest.mark.parametrize("effect", catalogue().values(), ids=lambda e: e.name)
+def test_catalogue_entry_is_complete(effect: Effect) -> None:
+    assert effect.title and effect.citation and effect.manoeuvre and effect.needs
+    assert (effect.formula.__doc__ or "").strip(), "the formula is written in its docstring"
+    assert effect.name in PLAIN or effect.name in ("wind", "motor_lag", "transport_delay")
+    for p in effect.parameters:
+        assert p.unit and p.meaning
+        assert p.low <= p.typical <= p.high
+        assert p.low <= p.neutral_for(VEHICLE) <= p.high
+    for other in (*effect.confounded_with, *effect.with_any, *effect.beyond):
+        assert other in catalogue(), f"{effect.name} names the unknown effect {other}"
+
+
+@pytest.mark.parametrize("effect", [e for e in catalogue().values() if e.parameters], ids=lambda e: e.name)
+def test_neutral_effect_changes_nothing(effect: Effect) -> None:
+    flight = sample(0.2, -0.3, 1.0, (2.0, -1.0, 0.5), 0.5, 0.5, 15.0)
+    drag = [("rotor_drag", {"x": 0.2, "y": 0.2})] if effect.with_any else []
+    with_it = reading(flight, *drag, (effect.name, effect.neutral(VEHICLE)))
+    np.testing.assert_allclose(with_it, reading(flight, *drag), atol=1e-5)
+
+
+def test_users_effect_is_one_file(tmp_path) -> None:
+    (tmp_path / "tether.py").write_text(
+        "from models.effect import Effect, Motion, Parameter, Stage\n"
+        "def formula(motion, *, pull):\n"
+        "    'A constant pull along body x.'\n"
+        "    return motion.with_(force=motion.force + pull * motion.rotation[:, 2, :] * 0.0 + pull)\n"
+        "EFFECT = Effect('tether', 'pull of a tether', Stage.FORCE, formula,\n"
+        "    (Parameter('pull', 'm/s^2', 'pull over mass', 0.0, 0.1, -5.0, 5.0),), ('quaternion',), 'hover', 'own')\n"
+    )
+    assert "tether" in catalogue(str(tmp_path))
+    motion = motion_of_flight(sample(0.1, 0.1, 0.0, (0, 0, 0), 0.4, 1.0, 16.0))
+    acted = act(motion, [(effect_named("tether", str(tmp_path)), {"pull": 0.5})])
+    assert isinstance(acted, Motion)
+    np.testing.assert_allclose(acted.force, 0.5)
+
+
+@pytest.mark.parametrize("text", ["x = 1\n", "import nothing_of_the_kind\n", "EFFECT = 3\n"])
+def test_unusable_users_effect_is_told_in_one_line(tmp_path, text: str) -> None:
+    (tmp_path / "bad.py").write_text(text)
+    with pytest.raises(InputError, match=r"bad\.py"):
+        catalogue(str(tmp_path))
+
+
+def test_unknown_effect_is_told_with_the_nearest_name() -> None:
+    with pytest.raises(InputError, match="rotor_drag"):
+        effect_named("rotordrag")
