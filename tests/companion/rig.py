@@ -1,4 +1,4 @@
-"""Real processes for the companion's tests: bridge, companion, a wiretap between them, a ground on Zenoh.
+"""Real processes for the companion's tests: bridge, companion, a wiretap between them, a ground on Zenoh."""
 
 from __future__ import annotations
 
