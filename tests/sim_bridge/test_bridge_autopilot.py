@@ -61,7 +61,9 @@ def offboard(vehicle: Vehicle, **parameters: float) -> Autopilot:
     return made
 
 
-@pytest.mark.parametrize("hidden", ["none", "thrust_gain:0.85", "motor_lag:0.058", "transport_delay:0.036", "wind:5"])
+@pytest.mark.parametrize(
+    "hidden", ["none", "thrust_gain:0.85", "motor_lag:0.058", "transport_delay:0.036", "wind:5"]
+)
 def test_takeoff_hold_and_land_work_whatever_is_hidden(vehicle: Vehicle, hidden: str) -> None:
     made = hovering(vehicle, hidden)
     run(made, 3.0)

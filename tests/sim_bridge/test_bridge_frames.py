@@ -16,7 +16,9 @@ from sim_bridge.truth.sensors import NO_NOISE
 from sim_bridge.world import PHYSICS_STEP
 
 
-def fly(vehicle: Vehicle, rates: tuple[float, float, float], command: float, seconds: float, yaw: float = 0.0):
+def fly(
+    vehicle: Vehicle, rates: tuple[float, float, float], command: float, seconds: float, yaw: float = 0.0
+):
     simulator = Simulator(vehicle, noise=NO_NOISE)
     simulator.start_in_hover((0.0, 0.0, 50.0), yaw)
     for _ in range(round(seconds / PHYSICS_STEP)):

@@ -66,14 +66,19 @@ def test_nothing_hidden_is_what_the_owner_believes(vehicle: Vehicle, seed: int) 
 
 @pytest.mark.parametrize("seed", STATES)
 def test_thrust_gain_scales_every_rotor(vehicle: Vehicle, seed: int) -> None:
-    force, torque, position, velocity, commands, _ = added(vehicle, Hidden("thrust_gain", {"gain": 1.15}), seed)
+    force, torque, position, velocity, commands, _ = added(
+        vehicle, Hidden("thrust_gain", {"gain": 1.15}), seed
+    )
     plain_force, plain_torque = wrench_of(airframe_with(vehicle), position, velocity, commands)
     assert force == pytest.approx(0.15 * plain_force)
     assert torque == pytest.approx(0.15 * plain_torque)
 
 
 def test_thrust_curve_is_right_at_hover_and_steeper_around_it(vehicle: Vehicle) -> None:
-    hidden, plain = airframe_with(vehicle, Hidden("thrust_curve", {"speed_blend": 1.0})), airframe_with(vehicle)
+    hidden, plain = (
+        airframe_with(vehicle, Hidden("thrust_curve", {"speed_blend": 1.0})),
+        airframe_with(vehicle),
+    )
     hover = vehicle.hover_thrust
     assert hidden.speed_of(hover) == pytest.approx(plain.speed_of(hover))
     # With a blend of one, rotor speed is proportional to the command and thrust to its square.
@@ -86,13 +91,17 @@ def test_battery_sag_is_a_power_of_the_voltage(vehicle: Vehicle, seed: int) -> N
     airframe = airframe_with(vehicle, Hidden("battery_sag", {"exponent": 1.5}))
     force, _ = wrench_of(airframe, position, velocity, commands)
     thrust = vehicle.weight / 4 * commands.sum() / vehicle.hover_thrust
-    assert rotation[:, 2] @ force == pytest.approx(thrust * (airframe.motion.voltage / vehicle.nominal_voltage) ** 1.5)
+    assert rotation[:, 2] @ force == pytest.approx(
+        thrust * (airframe.motion.voltage / vehicle.nominal_voltage) ** 1.5
+    )
 
 
 @pytest.mark.parametrize("seed", STATES)
 def test_rotor_drag_is_the_sum_of_h_forces(vehicle: Vehicle, seed: int) -> None:
     cx, cy = 0.3, 0.4
-    force, torque, _, velocity, commands, rotation = added(vehicle, Hidden("rotor_drag", {"x": cx, "y": cy}), seed)
+    force, torque, _, velocity, commands, rotation = added(
+        vehicle, Hidden("rotor_drag", {"x": cx, "y": cy}), seed
+    )
     air, omega = rotation.T @ velocity[:3], velocity[3:]
     expected_force, expected_torque = np.zeros(3), np.zeros(3)
     for arm, command in zip(vehicle.rotor_positions, commands, strict=True):

@@ -20,11 +20,15 @@ from sim_bridge.truth.sensors import NO_NOISE, Noise
 
 
 def believed_thrust(vehicle: Vehicle, times: np.ndarray, commands: np.ndarray) -> np.ndarray:
-    """Thrust over mass that the vehicle file promises: held commands, delay, first-order lag of rotor speed."""
+    """Thrust over mass that the vehicle file promises: held commands, delay, first-order lag of rotor
+    speed.
+    """
     fine = 0.0005
     grid = np.arange(0.0, times[-1], fine)
     held = np.searchsorted(times, grid - vehicle.command_delay + 1e-9, side="right") - 1
-    target = np.sqrt(np.where(held >= 0, commands[np.maximum(held, 0)], vehicle.hover_thrust) / vehicle.hover_thrust)
+    target = np.sqrt(
+        np.where(held >= 0, commands[np.maximum(held, 0)], vehicle.hover_thrust) / vehicle.hover_thrust
+    )
     speed, out = 1.0, np.empty_like(grid)
     follow = 1.0 - np.exp(-fine / vehicle.motor_time_constant)
     for i, wanted in enumerate(target):
@@ -59,7 +63,9 @@ def test_with_nothing_hidden_the_residual_is_the_sensors_noise(vehicle: Vehicle,
 
 
 def test_a_record_holds_what_was_flown(vehicle: Vehicle, design: Design, tmp_path: Path) -> None:
-    plan = Plan(vehicle, design, trajectory("circle", height=1.5, laps=1.0), choose(["rotor_drag:0.3"], vehicle, 1), 2)
+    plan = Plan(
+        vehicle, design, trajectory("circle", height=1.5, laps=1.0), choose(["rotor_drag:0.3"], vehicle, 1), 2
+    )
     samples: list[Sample] = []
     flown = record(plan, tmp_path / "one.mcap", tmp_path / "one.csv", samples.append)
     read = read_record(tmp_path / "one.mcap")

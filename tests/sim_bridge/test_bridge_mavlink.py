@@ -218,7 +218,10 @@ def test_frames_on_the_wire_are_those_of_px4(connect) -> None:
     battery = client.wait(lambda m: m.get_type() == "BATTERY_STATUS")
     assert sum(v for v in battery.voltages if v != 65535) * 1e-3 == pytest.approx(16.0, rel=0.05)
     assert min(client.of("ESC_STATUS", since)[-1].rpm) > 5000
-    assert client.wait(lambda m: m.get_type() == "EXTENDED_SYS_STATE").landed_state == mav.MAV_LANDED_STATE_IN_AIR
+    assert (
+        client.wait(lambda m: m.get_type() == "EXTENDED_SYS_STATE").landed_state
+        == mav.MAV_LANDED_STATE_IN_AIR
+    )
 
 
 def test_silence_lands_and_tells_the_ground_station(connect) -> None:

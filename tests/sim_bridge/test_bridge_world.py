@@ -104,7 +104,13 @@ def test_noise_has_the_stated_size_and_no_bias(vehicle: Vehicle) -> None:
     rows = []
     for i in range(4000):
         e = sensors.sample(
-            10_000 * i, [1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0], [0.0] * 6, (0.0, 0.0, 0.0), identity, 16.0, [9.0] * 4
+            10_000 * i,
+            [1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0],
+            [0.0] * 6,
+            (0.0, 0.0, 0.0),
+            identity,
+            16.0,
+            [9.0] * 4,
         )
         rows.append((*e.position, *e.velocity, *e.angular_velocity, *e.specific_force, e.battery_voltage))
     data = np.array(rows)
