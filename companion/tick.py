@@ -33,8 +33,9 @@ def make_tick(odometry: Odometry, latest: Latest, outcome: Outcome, latency: flo
     _set(tick.angular_velocity, odometry.angular_velocity)
     q = tick.quaternion
     q.w, q.x, q.y, q.z = odometry.quaternion
-    if latest.specific_force is not None:
-        _set(tick.specific_force, latest.specific_force)
+    force = latest.specific_force
+    if force is not None:
+        _set(tick.specific_force, force)
     reference, step = outcome.reference, outcome.step
     if reference is not None:
         _set(tick.position_reference, reference.position)

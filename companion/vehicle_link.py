@@ -94,10 +94,10 @@ class Odometry(NamedTuple):
 class Latest:
     """The last of everything that arrives beside the odometry; written by MAVSDK's thread, read by any.
 
-    `specific_force` m/s² FLU, `battery_voltage` V (0 unknown), `rotor_speed` rad/s (empty unknown).
+    `battery_voltage` V (0 unknown), `rotor_speed` rad/s (empty unknown). `imu` is HIGHRES_IMU as it came, not
+    yet read: it arrives just before the odometry, and what it takes to read it would delay the setpoint.
     """
 
-    specific_force: Vector | None = None
     battery_voltage: float = 0.0
     rotor_speed: tuple[float, ...] = ()
     flight_mode: str = "UNKNOWN"
@@ -105,6 +105,19 @@ class Latest:
     landed: str = "unknown"
     heartbeat: float = -math.inf
     texts: deque[str] = field(default_factory=lambda: deque(maxlen=20))
+    imu: str = ""
+
+    @property
+    def specific_force(self) -> Vector | None:
+        """Specific force of the accelerometer, m/s² FLU; None before the first message and for one that is no
+        number.
+        """
+        try:
+            fields = json.loads(self.imu)
+            x, y, z = fields["xacc"], -fields["yacc"], -fields["zacc"]
+        except (KeyError, TypeError, ValueError):
+            return None
+        return (x, y, z)
 
 
 @dataclass(frozen=True)
@@ -168,7 +181,6 @@ class VehicleLink:
         self._direct = MavlinkDirect(system)
         for name, handler in (
             ("ODOMETRY", self._odometry),
-            ("HIGHRES_IMU", self._imu),
             ("BATTERY_STATUS", self._battery),
             ("ESC_STATUS", self._esc),
             ("HEARTBEAT", self._heartbeat),
@@ -177,6 +189,7 @@ class VehicleLink:
             ("STATUSTEXT", self._text),
         ):
             self._direct.subscribe_message(name, self._safe(handler))
+        self._direct.subscribe_message("HIGHRES_IMU", self._imu)
 
     def close(self) -> None:
         """Disconnect."""
@@ -309,9 +322,9 @@ class VehicleLink:
         if odometry is not None:
             self.on_odometry(odometry)
 
-    def _imu(self, fields: dict[str, Any]) -> None:
+    def _imu(self, message: MavlinkMessage, _: Any) -> None:
         self._counts["HIGHRES_IMU"] += 1
-        self.latest.specific_force = (fields["xacc"], -fields["yacc"], -fields["zacc"])
+        self.latest.imu = message.fields_json
 
     def _battery(self, fields: dict[str, Any]) -> None:
         self._counts["BATTERY_STATUS"] += 1
