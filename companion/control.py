@@ -69,6 +69,11 @@ class Corrector(Protocol):
 
     wants_yaw: bool
 
+    @property
+    def applied(self) -> Vector:
+        """The correction of the previous tick, as applied, m/s², heading frame."""
+        ...
+
     def step(self, features: list[float], dt: float) -> tuple[Vector, Vector]:
         """Error acceleration to cancel (m/s², heading frame): as applied, and as the model returned it."""
         ...
@@ -202,7 +207,11 @@ class ControlLaw:
         if corrector is None:
             return ControlStep(plain, ZERO, ZERO, plain, self.normalised(plain.thrust))
         voltage = state.battery_voltage if state.battery_voltage > 0.0 else self.vehicle.nominal_voltage
-        applied, raw = corrector.step(features(state, zeta[2], attitude, voltage, corrector.wants_yaw), dt)
+        # (22) solves for u with delta at u*, which is off by delta's own dependence on u (thrust that is 10 % short
+        # asks for 10 % too much tilt). Evaluating at u* minus the previous correction is the fixed point of that
+        # equation, approached by one step a tick, at the price of none.
+        expected = self.corrected(attitude, corrector.applied)
+        applied, raw = corrector.step(features(state, zeta[2], expected, voltage, corrector.wants_yaw), dt)
         command = self.command(zeta, self.corrected(attitude, applied), reference.yaw)
         return ControlStep(plain, applied, raw, command, self.normalised(command.thrust))
 

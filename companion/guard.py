@@ -97,6 +97,11 @@ class Guard:
         """Whether it gave up on this model for the rest of the flight."""
         return self._mode == TRIPPED
 
+    @property
+    def applied(self) -> Vector:
+        """The correction of the last step, m/s², heading frame."""
+        return self._applied
+
     def start(self) -> None:
         """Fade the correction in. No effect after a trip: that latches."""
         if self._mode in (OFF, FADING_OUT):

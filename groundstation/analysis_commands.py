@@ -44,6 +44,7 @@ def register(app: typer.Typer) -> None:
     app.command("diagnose")(diagnose_command)
     app.command("effects")(effects_command)
     app.add_typer(model_app, name="model")
+    app.command("demo")(demo_command)
 
 
 def print_json(table: Any) -> None:
@@ -228,6 +229,30 @@ def _same(flight: Flight) -> Path | None:
     """The vehicle file of the first flight also serves the second."""
     source = Path(flight.vehicle.source)
     return source if source.is_file() else None
+
+
+def demo_command(
+    seed: Annotated[int, typer.Option("--seed", help="Draws the hidden effect and the noise.")] = 7,
+    hidden: Annotated[
+        list[str] | None, typer.Option("--hidden", help="Hide this effect instead of a drawn one.")
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for everything it makes.")] = Path(
+        "out/demo"
+    ),
+    real: Annotated[bool, typer.Option("--real/--no-real", help="Also analyse real flights.")] = True,
+    viewer: Annotated[
+        bool, typer.Option("--viewer/--no-viewer", help="Open Rerun where there is a display.")
+    ] = True,
+) -> None:
+    """The main job end to end on a simulated vehicle with a hidden effect, then on real flights.
+
+    Example: groundstation demo --seed 7
+    """
+    from groundstation.demo import demonstrate, real_flights
+
+    demonstrate(output, seed, hidden or [], console, viewer)
+    if real:
+        real_flights(console)
 
 
 def effects_command(

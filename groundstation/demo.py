@@ -1,0 +1,400 @@
+"""The main job, end to end: fly, compare, see where, name the missing effect, add it, fly again, reveal.
+
+Simulator and companion run as processes of their own, as they would on a desk and on a vehicle; nothing here knows
+what is hidden until `sim-bridge reveal` prints it at the end.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from groundstation.compare import compare, waterfall
+from groundstation.diagnosis import Diagnosis, diagnose
+from groundstation.link import Link
+from groundstation.reading import read_flight
+from groundstation.results import Comparison
+from groundstation.settings import Settings
+from groundstation.store import add_effect, lineage, save
+from groundstation.tables import (
+    SAID,
+    percent,
+    print_comparisons,
+    print_diagnosis,
+    print_waterfall,
+    print_where,
+)
+from groundstation.tracking import Tracking, track_file
+from groundstation.where import where_it_fails
+from models.errors import InputError
+from models.export import export_onnx, not_exported
+from models.flight import Flight
+from models.model import Model, rigid_body_model
+from models.vehicle import Vehicle, load_vehicle
+
+VEHICLE = Path(__file__).parent.parent / "models" / "vehicles" / "quad5" / "vehicle.toml"
+SURVEY = ("excitation", {})
+TASK = ("lemniscate", {"speed": 2.5, "height": 0.8})
+MARK = ".trueflight-demo"
+STARTING = 30.0
+"""s that a process may take until it says ready."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a demonstration measured."""
+
+    folder: Path
+    diagnosis: Diagnosis
+    before: Comparison
+    after: Comparison
+    tracking: tuple[Tracking, Tracking]
+    revealed: str
+    recordings: tuple[Path, ...]
+    seconds: float
+
+
+def demonstrate(
+    folder: Path, seed: int, hidden: Sequence[str], console: Console, open_viewer: bool = True
+) -> Outcome:
+    """Run the whole job in `folder` on an effect drawn from `seed` (or on the effects in `hidden`)."""
+    started = time.monotonic()
+    _make(folder)
+    vehicle = load_vehicle(VEHICLE)
+    sealed = folder / "answer.sealed"
+    with _processes(folder, seed, hidden, sealed) as (endpoint, pids):
+        _step(
+            console, "Three processes", f"bridge {pids[0]}, companion {pids[1]}, ground station {os.getpid()}"
+        )
+        settings = Settings(connect=(endpoint,), name=vehicle.name)
+        with Link(settings) as link:
+            survey = _fly(console, link, folder, *SURVEY, "lqr")
+            task = _fly(console, link, folder, *TASK, "lqr")
+            model, diagnosis, before, after, recordings = _analyse(console, folder, vehicle, survey, task)
+            corrected = _deploy_and_fly(console, link, folder, model, survey)
+    _step(console, "The answer", "sim-bridge reveal")
+    revealed = _reveal(sealed, hidden)
+    console.print(f"hidden was: {revealed}", highlight=False)
+    tracking = (track_file(task), track_file(corrected))
+    recordings += _tracking_recording(folder, tracking)
+    outcome = Outcome(
+        folder, diagnosis, before, after, tracking, revealed, recordings, time.monotonic() - started
+    )
+    _summary(console, outcome)
+    if open_viewer and (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"
+    ):
+        subprocess.Popen([_program("rerun"), *map(str, recordings)], start_new_session=True)
+    return outcome
+
+
+def _make(folder: Path) -> None:
+    """An empty folder; only an earlier demonstration's is emptied."""
+    mark = folder / MARK
+    if folder.exists() and any(folder.iterdir()):
+        if not mark.exists():
+            raise InputError(
+                f"{folder}: holds files that are no demonstration's; choose another folder with --output"
+            )
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    mark.write_text("made by groundstation demo, which may empty this folder\n", encoding="utf-8")
+
+
+def _step(console: Console, title: str, command: str) -> None:
+    console.print()
+    console.rule(f"[bold]{title}[/bold]  [dim]{command}[/dim]", align="left")
+
+
+# --- processes ---------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _processes(
+    folder: Path, seed: int, hidden: Sequence[str], sealed: Path
+) -> Iterator[tuple[str, tuple[int, int]]]:
+    """Bridge and companion, ready; ended by their ids whatever happens. Yields the Zenoh endpoint."""
+    companion_port, vehicle_port, pilot_port = (_free(socket.SOCK_DGRAM) for _ in range(3))
+    endpoint = f"tcp/127.0.0.1:{_free(socket.SOCK_STREAM)}"
+    effects = [argument for name in (hidden or ["random"]) for argument in ("--hidden", name)]
+    bridge = _start(
+        folder / "bridge.log",
+        ["sim-bridge", "run", "--vehicle", VEHICLE, *effects, "--seed", seed, "--sealed", sealed]
+        + [
+            "--mavlink",
+            f"udpout:127.0.0.1:{companion_port}",
+            "--port",
+            vehicle_port,
+            "--pilot-port",
+            pilot_port,
+        ],
+    )
+    companion = None
+    try:
+        _wait_ready(bridge, folder / "bridge.log")
+        companion = _start(
+            folder / "companion.log",
+            ["companion", "run", "--vehicle", VEHICLE, "--connect", f"udpin://127.0.0.1:{companion_port}"]
+            + [
+                "--listen",
+                endpoint,
+                "--records",
+                folder / "on-board",
+                "--models",
+                folder / "on-board-models",
+            ],
+        )
+        _wait_ready(companion, folder / "companion.log")
+        yield endpoint, (bridge.pid, companion.pid)
+    finally:
+        for process in (companion, bridge):
+            if process is not None:
+                _end(process)
+
+
+def _program(name: str) -> str:
+    """A program of this installation: beside the interpreter, or on the path."""
+    beside = Path(sys.executable).parent / name
+    return str(beside) if beside.exists() else name
+
+
+def _start(log: Path, command: list[object]) -> subprocess.Popen[bytes]:
+    words = [_program(str(command[0])), *map(str, command[1:])]
+    try:
+        with log.open("wb") as out:
+            return subprocess.Popen(words, stdout=out, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+    except OSError as error:
+        raise InputError(
+            f"{command[0]}: cannot be started ({error.strerror}); pip install 'trueflight[all]'"
+        ) from None
+
+
+def _wait_ready(process: subprocess.Popen[bytes], log: Path) -> None:
+    end = time.monotonic() + STARTING
+    while time.monotonic() < end:
+        text = log.read_text(errors="replace")
+        if "ready:" in text:
+            return
+        if process.poll() is not None:
+            last = (text.strip().splitlines() or ["it said nothing"])[-1]
+            raise InputError(f"{log.stem} ended before it was ready: {last} (see {log})")
+        time.sleep(0.05)
+    raise InputError(f"{log.stem} was not ready within {STARTING:g} s; see {log}")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    for ask, patience in ((signal.SIGINT, 10.0), (signal.SIGKILL, 5.0)):
+        if process.poll() is not None:
+            return
+        process.send_signal(ask)
+        try:
+            process.wait(patience)
+        except subprocess.TimeoutExpired:
+            continue
+
+
+def _free(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+# --- the job -----------------------------------------------------------------------------------------------------
+
+
+def _fly(
+    console: Console, link: Link, folder: Path, name: str, parameters: dict[str, float], controller: str
+) -> Path:
+    """One mission from takeoff to landing; the path of its record on the ground."""
+    _step(
+        console,
+        f"Fly {name}, controller {controller}",
+        f"groundstation fly {name} --controller {controller} --wait",
+    )
+    mission = {"trajectory": name, "parameters": parameters, "controller": controller, "repeat": 1}
+    answer = link.request("mission", mission)
+    with console.status(f"flying {name}: {answer['duration']:.0f} s and takeoff and landing"):
+        while True:
+            entry = next(m for m in link.status()["missions"] if m["mission"] == answer["mission"])
+            if entry["state"] in ("finished", "failed", "aborted"):
+                break
+            time.sleep(0.2)
+    if entry["state"] != "finished":
+        raise InputError(
+            f"mission {name} {entry['state']}: {entry['reason']}; see {folder / 'companion.log'}"
+        )
+    record = link.fetch_record(entry["record"], folder)
+    named = record.with_name(f"{name}-{controller}.mcap")
+    record.replace(named)
+    console.print(f"flown and fetched: {named}", highlight=False)
+    return named
+
+
+def _analyse(
+    console: Console, folder: Path, vehicle: Vehicle, survey: Path, task: Path
+) -> tuple[Model, Diagnosis, Comparison, Comparison, tuple[Path, ...]]:
+    """Compare, see where, diagnose, add what is missing. Returns the last model and what was measured."""
+    from groundstation.views import write_before_after, write_comparison, write_where
+
+    fitted, held_out = read_flight(survey), read_flight(task)
+    base = rigid_body_model(vehicle)
+    store = folder / "models"
+    _step(console, "Compare the model with the flight", f"groundstation compare {survey.name}")
+    before = compare(fitted, base)
+    print_comparisons(console, [compare(fitted, m) for m in lineage(store, base)[:1]] + [before])
+    where = where_it_fails(before)
+    print_where(console, where)
+    _step(console, "Diagnose", f"groundstation diagnose {survey.name} --validate {task.name}")
+    diagnosis = diagnose(fitted, base, held_out)
+    print_diagnosis(console, diagnosis)
+    model, parent = base, None
+    for name in diagnosis.named("missing") or diagnosis.named("possible")[:1]:
+        _step(
+            console,
+            f"Add {name}",
+            f"groundstation model add {name} --flight {survey.name} --validate {task.name}",
+        )
+        model, path = save(store, add_effect(model, name, [fitted]), parent)
+        parent = model
+        console.print(f"new model version: {path}", highlight=False)
+    line = [*lineage(store, base)[:1], base, *(m for m in lineage(store, model) if m.version)]
+    steps = waterfall(fitted, held_out, line)
+    print_waterfall(console, steps, fitted.name, held_out.name)
+    after = compare(fitted, model)
+    recordings = tuple(folder / f"{n}.rrd" for n in ("comparison", "where", "before-after"))
+    write_comparison(recordings[0], [compare(fitted, m) for m in line], where_it_fails(after))
+    write_where(recordings[1], before, where)
+    write_before_after(
+        recordings[2], [compare(fitted, m) for m in line], [compare(held_out, m) for m in line], steps
+    )
+    return model, diagnosis, before, after, recordings
+
+
+def _deploy_and_fly(console: Console, link: Link, folder: Path, model: Model, survey: Path) -> Path:
+    """Export, deploy, and fly the task corrected."""
+    _step(console, "Deploy", "groundstation model export; groundstation deploy")
+    file = folder / "correction.onnx"
+    with console.status("exporting to ONNX"):
+        file.write_bytes(export_onnx(model, read_flight(survey)))
+    answer = link.request("model", file.read_bytes(), 30.0)
+    console.print(f"accepted by the companion: {answer.get('reason') or file.name}", highlight=False)
+    for effect in not_exported(model):
+        console.print(
+            f"{effect} stays on the ground: a static correction has neither memory nor a sensor, so tracking gains "
+            "only from the rest of the model",
+            style="yellow",
+        )
+    return _fly(console, link, folder, *TASK, "corrected")
+
+
+def _reveal(sealed: Path, hidden: Sequence[str]) -> str:
+    if hidden:
+        return ", ".join(hidden)
+    done = subprocess.run(
+        [_program("sim-bridge"), "reveal", str(sealed)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise InputError(f"sim-bridge reveal failed: {done.stderr.strip()}")
+    return " ".join(done.stdout.split())
+
+
+def _tracking_recording(folder: Path, tracking: tuple[Tracking, Tracking]) -> tuple[Path, ...]:
+    from groundstation.views import write_tracking
+
+    path = folder / "tracking.rrd"
+    write_tracking(path, tracking)
+    return (path,)
+
+
+# --- what comes out ----------------------------------------------------------------------------------------------
+
+
+def _summary(console: Console, o: Outcome) -> None:
+    _step(console, "Before and after", str(o.folder))
+    table = Table(show_header=True)
+    for column, side in (
+        ("error", "left"),
+        ("unit", "left"),
+        ("before", "right"),
+        ("after", "right"),
+        ("", "right"),
+    ):
+        table.add_column(column, justify=side)  # type: ignore[arg-type]
+    d = o.diagnosis
+
+    def row(what: str, unit: str, before: float, after: float) -> None:
+        ratio = f"÷ {before / after:.1f}" if after > 0 else ""
+        table.add_row(what, unit, f"{before:.3g}", f"{after:.3g}", ratio)
+
+    row("model, fitted flight (residual RMS)", "m/s²", d.rms_before, d.rms_after)
+    table.add_row("  of which sensor noise", "m/s²", "", f"{d.noise_floor:.3g}", "", style="dim")
+    if d.validation_before is not None and d.validation_after is not None:
+        row("model, held-out flight (residual RMS)", "m/s²", d.validation_before, d.validation_after)
+    for b, a in zip(o.before.horizons[-1:], o.after.horizons[-1:], strict=True):
+        row(
+            f"open-loop position after {b.horizon:g} s",
+            "m",
+            sum(x * x for x in b.position) ** 0.5,
+            sum(x * x for x in a.position) ** 0.5,
+        )
+    lqr, corrected = o.tracking
+    for i, axis in enumerate("xyz"):
+        row(f"tracking the linear behaviour, {axis} (MSE)", "m²", lqr.mse[i], corrected.mse[i])
+    console.print(table)
+    found = d.named("missing") or d.named("possible")
+    console.print(
+        f"found: [bold]{', '.join(found) or 'nothing missing'}[/bold]; hidden was: {o.revealed}",
+        highlight=False,
+    )
+    console.print(
+        f"Rerun recordings: {' '.join(str(p) for p in o.recordings)}", highlight=False, soft_wrap=True
+    )
+    console.print(f"{o.seconds:.0f} s", style="dim")
+
+
+REAL = (
+    ("crazyswarm2_log08.csv", "upgraded motors"),
+    ("crazyswarm2_log44.csv", "upgraded motors"),
+    ("crazyswarm2_log201.csv", "carries a payload"),
+)
+"""Real flights in the repository, and what is known of them."""
+
+
+def real_flights(console: Console) -> list[tuple[Flight, Diagnosis]]:
+    """The same analysis on real Crazyflie flights: what it finds, in one table."""
+    folder = Path(__file__).parent.parent / "samples" / "crazyflie"
+    _step(console, "Real flights of Crazyflies", "groundstation diagnose samples/crazyflie/...")
+    table = Table()
+    for column in ("flight", "known of it", "found", "residual m/s²"):
+        table.add_column(column)
+    results = []
+    for file, known in REAL:
+        with console.status(f"diagnosing {file}"):
+            flight = read_flight(folder / file)
+            result = diagnose(flight, rigid_body_model(flight.vehicle))
+        results.append((flight, result))
+        found = []
+        for e in result.effects:
+            if e.verdict in ("missing", "possible") and e.rank:
+                values = ", ".join(
+                    f"{p.name} {p.value:.3g} [{p.low:.3g}, {p.high:.3g}]" for p in e.parameters
+                )
+                told = "" if e.verdict == "missing" else f" ({SAID['possible']})"
+                found.append(f"{e.name}{told}: {values}; {percent(e.variance_share)} of the error")
+        table.add_row(
+            file, known, "\n".join(found) or "nothing", f"{result.rms_before:.3f} -> {result.rms_after:.3f}"
+        )
+    console.print(table)
+    return results
