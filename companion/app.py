@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import sys
 import time
@@ -21,8 +22,22 @@ from models.design import load_design
 from models.errors import InputError
 from models.vehicle import load_vehicle
 
+_M_ARENA_MAX = -8  # malloc.h
 _RATE_TRIES = 10
-_SWITCH_INTERVAL = 0.0005
+_SWITCH_INTERVAL = 0.0001  # s
+
+
+def _return_memory() -> None:
+    """Give what starting needed back to the system, and let threads share one heap: small boards have little.
+
+    Only where the C library is glibc; anywhere else there is nothing to do.
+    """
+    try:
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_ARENA_MAX, 1)
+        library.malloc_trim(0)
+    except (OSError, AttributeError):
+        return
 
 
 class Companion:
@@ -91,6 +106,7 @@ class Companion:
         gc.collect()
         gc.freeze()
         gc.disable()
+        _return_memory()
         # How long another Python thread may keep the control thread from running.
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.director.run()

@@ -13,9 +13,6 @@ from types import FrameType
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from models.errors import run_command_line
 
@@ -133,9 +130,11 @@ def run(
 
 @app.command(epilog="Example: companion check --connect udpin://127.0.0.1:14540 --json")
 def check(connect: Connect = None, rate: Rate = None, timeout: Timeout = None, as_json: Json = False) -> None:
-    """Connect and tell what arrives: rates, mode, battery, and the parameters that decide what happens in
-    trouble.
-    """
+    """Connect and tell what arrives: rates, mode, battery, and the parameters that matter in trouble."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
     from companion.settings import Settings
     from companion.vehicle_link import VehicleLink
 
@@ -178,6 +177,10 @@ def check(connect: Connect = None, rate: Rate = None, timeout: Timeout = None, a
 @app.command(epilog="Example: companion trajectories --json")
 def trajectories(as_json: Json = False) -> None:
     """List the trajectories that can be flown by name, with their parameters."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
     from models.reference import KINDS
 
     if as_json:
