@@ -48,17 +48,17 @@ def _tell(value: dict[str, Any], text: str, as_json: bool) -> None:
     typer.echo(json.dumps(value) if as_json else text)
 
 
-def _hide(settings: Settings, vehicle: Vehicle, default: Path) -> tuple[tuple[Hidden, ...], Path | None]:
-    """What is hidden, and where the answer was sealed (None: the user knows it already)."""
+def _seal(settings: Settings, hidden: tuple[Hidden, ...], vehicle: Vehicle, default: Path) -> Path | None:
+    """Seal what is hidden and return where (None: the user knows it already). Last of all, when nothing can
+    fail: the answer to an earlier flight must not be lost to a mistyped one.
+    """
     from sim_bridge.seal import seal
-    from sim_bridge.truth.hidden import choose
 
-    hidden = choose(list(settings.hidden), vehicle, settings.seed, settings.hidden_count)
-    path = Path(settings.sealed) if settings.sealed else default
     if not settings.sealed and "random" not in settings.hidden:
-        return hidden, None
+        return None
+    path = Path(settings.sealed) if settings.sealed else default
     seal(hidden, vehicle.name, settings.seed, path)
-    return hidden, path
+    return path
 
 
 def _told(settings: Settings, sealed: Path | None) -> str:
@@ -106,6 +106,7 @@ def run(
     from sim_bridge.mavlink.server import PILOT_MODES, Link, Server, pilot_order
     from sim_bridge.parameters import Parameters
     from sim_bridge.simulator import Simulator
+    from sim_bridge.truth.hidden import choose
 
     if settings.pilot_mode not in PILOT_MODES:
         raise InputError(f"--pilot-mode {settings.pilot_mode}: choose one of {', '.join(PILOT_MODES)}")
@@ -115,9 +116,10 @@ def run(
     for assignment in param or ():
         parameters.set_text(assignment)
     link = Link(("127.0.0.1", settings.port), settings.remote, settings.pilot_port)
-    effects, answer = _hide(settings, believed, Path("hidden.sealed"))
+    effects = choose(list(settings.hidden), believed, settings.seed, settings.hidden_count)
     autopilot = Autopilot(Simulator(believed, effects, settings.seed, settings.sensor_noise), parameters)
     server = Server(autopilot, link, settings.speed)
+    answer = _seal(settings, effects, believed, Path(f"hidden-seed-{settings.seed}.sealed"))
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda caught, frame: stopped.append(caught))
@@ -193,16 +195,14 @@ def fly(
     believed = load_vehicle(settings.vehicle)
     from models.design import load_design
     from sim_bridge.in_process import Plan, record
+    from sim_bridge.truth.hidden import choose
 
-    if output.exists():
-        # Before the answer is sealed: the one beside an older record must not be lost.
-        raise InputError(f"{output}: exists already; choose another --output")
     gains = Path(settings.design) if settings.design else Path(settings.vehicle).with_name("design.json")
     plan = Plan(
         believed,
         load_design(gains, believed),
         _trajectory(trajectory, parameter or []),
-        *_hide(settings, believed, output.with_suffix(".sealed"))[:1],
+        choose(list(settings.hidden), believed, settings.seed, settings.hidden_count),
         settings.seed,
         repeat,
         rate,
@@ -212,8 +212,7 @@ def fly(
     csv_file = output.with_suffix(".csv") if table else None
     with _Progress(plan.repeat * plan.trajectory.duration * rate, as_json) as progress:
         flown = record(plan, output, csv_file, progress)
-    answer = Path(settings.sealed) if settings.sealed else output.with_suffix(".sealed")
-    told = answer if settings.sealed or "random" in settings.hidden else None
+    told = _seal(settings, plan.hidden, believed, output.with_suffix(".sealed"))
     report = {
         "record": str(output),
         "csv": str(csv_file) if csv_file else None,

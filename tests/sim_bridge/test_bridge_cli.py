@@ -82,7 +82,7 @@ def test_fly_writes_a_record_and_seals_the_answer(tmp_path: Path) -> None:
     assert effect["name"] not in done.stdout + done.stderr
     before = (tmp_path / "one.sealed").read_bytes()
     again = command(*fly, "--hidden", "random", "--seed", "8", cwd=tmp_path)
-    assert again.returncode == 2 and "exists already" in again.stderr
+    assert again.returncode == 2 and "one.mcap: cannot write" in again.stderr
     assert (tmp_path / "one.sealed").read_bytes() == before
 
 
@@ -112,8 +112,11 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments: tuple[str, ...], says:
 
 def test_a_port_in_use_is_told(bridge, tmp_path: Path) -> None:
     running: Bridge = bridge()
-    done = command("run", *VEHICLE, "--port", str(running.port), "--pilot-port", "0")
+    hide = ("--hidden", "random", "--sealed", "earlier.sealed")
+    (tmp_path / "earlier.sealed").write_text("the answer to an earlier flight")
+    done = command("run", *VEHICLE, *hide, "--port", str(running.port), "--pilot-port", "0", cwd=tmp_path)
     assert done.returncode == 2
+    assert (tmp_path / "earlier.sealed").read_text() == "the answer to an earlier flight"
     assert f"UDP port {running.port} on 127.0.0.1 is in use" in done.stderr
 
 
