@@ -1,0 +1,9 @@
+"""Rerun views of what the analyses return: one recording each, with its blueprint."""
+
+from groundstation.views.before_after import write_before_after
+from groundstation.views.comparison import write_comparison
+from groundstation.views.monitor import monitor
+from groundstation.views.tracking import write_tracking
+from groundstation.views.where import write_where
+
+__all__ = ["monitor", "write_before_after", "write_comparison", "write_tracking", "write_where"]

@@ -1,0 +1,79 @@
+"""Recordings on disk: opened beside their final name, and there only when whole."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from models.errors import InputError
+
+TIME = "flight_time"
+"""The timeline of everything that happened in a flight: s on the flight's clock."""
+MOST_POINTS = 4000
+"""Points of one curve; more cannot be seen and make the recording slow."""
+
+
+@contextmanager
+def recording(path: Path, kind: str, name: str) -> Iterator[rr.RecordingStream]:
+    """A stream that writes the recording `path`; `kind` names the view, `name` this one of its kind.
+
+    Raises `InputError` where it cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.touch()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot write the recording ({error.strerror}); choose another --rrd"
+        ) from None
+    stream = rr.RecordingStream(f"trueflight {kind}")
+    try:
+        stream.save(partial)
+        stream.send_recording_name(name)
+        yield stream
+        stream.flush()
+        stream.disconnect()
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def between(start: float, end: float) -> rr.TimeRange:
+    """A stretch of flight time to look at first, s."""
+    return rr.TimeRange(
+        start=rr.TimeRangeBoundary.absolute(seconds=start), end=rr.TimeRangeBoundary.absolute(seconds=end)
+    )
+
+
+def thin(n: int, most: int = MOST_POINTS) -> slice:
+    """Every how many of `n` samples to show."""
+    return slice(None, None, max(1, -(-n // most)))
+
+
+def curve(
+    stream: rr.RecordingStream,
+    path: str,
+    t: np.ndarray,
+    values: np.ndarray,
+    name: str,
+    color: tuple[int, int, int],
+    width: float = 1.5,
+) -> None:
+    """A curve over flight time: `t` (N,) in s, `values` (N,); missing values interrupt it."""
+    step = thin(len(t))
+    stream.log(path, rr.SeriesLines(colors=[color], names=name, widths=[width]), static=True)
+    stream.send_columns(
+        path,
+        indexes=[rr.TimeColumn(TIME, duration=np.asarray(t[step], dtype=float))],
+        columns=rr.Scalars.columns(scalars=np.asarray(values[step], dtype=float)),
+    )
+
+
+def text(stream: rr.RecordingStream, path: str, markdown: str) -> None:
+    """A page of text."""
+    stream.log(path, rr.TextDocument(markdown, media_type="text/markdown"), static=True)
