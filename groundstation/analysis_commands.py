@@ -140,12 +140,9 @@ def compare_command(
 
 
 def _versions(model: Model, store: Path) -> list[Model]:
-    """The linear model, and the versions from it to `model`."""
+    """The models from the linear one to `model`."""
     from groundstation.store import lineage
-    from models.model import linear_model
 
-    if model.version == 0:
-        return [linear_model(model.vehicle), model] if model.terms else [model]
     return lineage(store, model)
 
 
@@ -348,8 +345,6 @@ def model_add(
         made = add_effect(base, effect, [read], bandwidth)
     made, path = save(store, made, base if base.version else None)
     line = lineage(store, made)
-    if base.version == 0 and base.terms:
-        line.insert(1, base)
     steps = waterfall(read, held_out, line, bandwidth)
     if rrd is not None:
         from groundstation.views import write_before_after

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from groundstation.fitting import with_clock
 from groundstation.measurement import Measurement, measure
 from groundstation.results import AxisError, Comparison, HorizonError, WaterfallStep
 from models.effect import Motion
@@ -28,9 +29,11 @@ def compare(
     """
     measurement = measure(flight, bandwidth, thin=False)
     motion = motion_of_flight(flight)
+    thinned = measure(flight, bandwidth)
+    chain = with_clock(thinned, model.chain())
     measured = _heading_acceleration(motion, measurement.value)
-    predicted = _predicted(measurement, motion, model.chain())
-    linear = _predicted(measurement, motion, linear_model(flight.vehicle).chain())
+    predicted = _predicted(measurement, motion, chain)
+    linear = _predicted(measurement, motion, with_clock(thinned, linear_model(flight.vehicle).chain()))
     residual = measured - predicted
     used = measurement.used & np.isfinite(residual[:, measurement.axes[-1]])
     mse, mse_linear = (np.mean(r[used] ** 2, axis=0) for r in (residual, measured - linear))
@@ -51,7 +54,7 @@ def compare(
         used=used,
         bandwidth=measurement.bandwidth,
         axes=axes,
-        horizons=_horizons(flight, motion, model.chain(), measurement.used) if horizons else (),
+        horizons=_horizons(flight, motion, chain, measurement.used) if horizons else (),
         rms=float(np.sqrt(np.mean(mse[chosen]))),
         noise_floor=float(np.sqrt(np.mean(floor[chosen] ** 2))),
     )

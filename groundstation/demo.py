@@ -253,7 +253,7 @@ def _analyse(
     store = folder / "models"
     _step(console, "Compare the model with the flight", f"groundstation compare {survey.name}")
     before = compare(fitted, base)
-    print_comparisons(console, [compare(fitted, m) for m in lineage(store, base)[:1]] + [before])
+    print_comparisons(console, [compare(fitted, m) for m in lineage(store, base)])
     where = where_it_fails(before)
     print_where(console, where)
     _step(console, "Diagnose", f"groundstation diagnose {survey.name} --validate {task.name}")
@@ -269,7 +269,7 @@ def _analyse(
         model, path = save(store, add_effect(model, name, [fitted]), parent)
         parent = model
         console.print(f"new model version: {path}", highlight=False)
-    line = [*lineage(store, base)[:1], base, *(m for m in lineage(store, model) if m.version)]
+    line = lineage(store, model)
     steps = waterfall(fitted, held_out, line)
     print_waterfall(console, steps, fitted.name, held_out.name)
     after = compare(fitted, model)

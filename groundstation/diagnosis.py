@@ -22,6 +22,7 @@ from groundstation.fitting import (
     fit,
     long_run_variance,
     model_of,
+    with_clock,
 )
 from groundstation.measurement import Measurement, measure
 from groundstation.remainder import Unexplained, unexplained
@@ -434,9 +435,10 @@ class _Search:
         )
 
     def _before(self, problem: Problem | None = None) -> float:
-        """Mean squared error of the base model as it stands, nothing refitted."""
+        """Mean squared error of the base model as it stands, nothing refitted but the clock."""
         problem = problem or self.problem
-        return float(np.mean((problem.measured() - problem.predict(self.base.chain())) ** 2))
+        chain = with_clock(problem.measurements[0], self.base.chain())
+        return float(np.mean((problem.measured() - problem.predict(chain)) ** 2))
 
     def _estimates(self, fitted: Fit, name: str) -> tuple[ParameterEstimate, ...]:
         return tuple(

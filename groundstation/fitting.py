@@ -21,7 +21,7 @@ from groundstation.measurement import Measurement
 from models.effect import Effect, Parameter, Stage
 from models.effects import effect_named
 from models.model import Model, Term
-from models.prediction import act, motion_of_flight, specific_force
+from models.prediction import Chain, act, motion_of_flight, specific_force
 from models.vehicle import Vehicle
 
 HAC_LAG = 2.0
@@ -304,6 +304,29 @@ def long_run_variance(problem: Problem, residual: np.ndarray) -> float:
         total += float(np.sum((sums[lag:] - sums[:-lag]) ** 2)) / lag
         offset += count
     return max(total, float(np.sum(residual**2))) / residual.size
+
+
+def with_clock(measurement: Measurement, chain: Chain) -> Chain:
+    """The chain with the delay between the flight's columns set as well as one sample of freedom allows.
+
+    A shift of the clock belongs to a log, not to a model: every comparison finds it anew.
+    """
+    if any(effect.name == "transport_delay" for effect, _ in chain):
+        return chain
+    problem, delay = Problem((measurement,)), effect_named("transport_delay")
+    believed, period = problem.vehicle.command_delay, measurement.flight.dt
+    measured = problem.measured()
+
+    def error(value: float) -> float:
+        return float(np.sum((measured - problem.predict([*chain, (delay, {"delay": value})])) ** 2))
+
+    found = optimize.minimize_scalar(
+        error,
+        bounds=(max(0.0, believed - period), believed + period),
+        method="bounded",
+        options={"xatol": 0.02 * period},
+    )
+    return [*chain, (delay, {"delay": float(found.x)})]
 
 
 def block_errors(fit_: Fit, blocks: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from groundstation.measurement import measure
 from models.effects import effect_named
 from models.errors import InputError
 from models.flight import Flight
-from models.model import Model, Term, linear_model, read_model, write_model
+from models.model import Model, Term, linear_model, read_model, rigid_body_model, write_model
 from models.vehicle import Vehicle
 
 DEFAULT_STORE = Path("trueflight-models")
@@ -45,12 +45,14 @@ def find(store: Path, vehicle: str, which: str) -> Model:
 
 
 def lineage(store: Path, model: Model) -> list[Model]:
-    """The versions that led to `model`, the linear model first."""
+    """The models that led to `model`: the linear one, exact rotation, then every version."""
     by_number = {m.version: m for m in map(read_model, versions(store, model.vehicle.name))}
     line = [model]
     while line[-1].parent is not None and line[-1].parent in by_number:
         line.append(by_number[line[-1].parent])
     if line[-1].version != 0:
+        line.append(rigid_body_model(model.vehicle, model.effects_directory))
+    if line[-1].terms:
         line.append(linear_model(model.vehicle))
     return line[::-1]
 

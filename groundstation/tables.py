@@ -40,13 +40,12 @@ def print_comparisons(console: Console, comparisons: Sequence[Comparison]) -> No
         f"below {first.bandwidth:g} Hz",
         title_justify="left",
     )
-    table.add_column("model")
+    table.add_column("model", no_wrap=True)
     for a in first.axes:
         table.add_column(a.axis, justify="right")
-        table.add_column("explained", justify="right")
-    if first.horizons:
-        for h in first.horizons:
-            table.add_column(f"position after\n{h.horizon:g} s open loop", justify="right")
+        table.add_column("expl.", justify="right", no_wrap=True)
+    for h in first.horizons:
+        table.add_column(f"{h.horizon:g} s", justify="right", no_wrap=True)
     for c in comparisons:
         cells = [c.label]
         for a in c.axes:
@@ -58,6 +57,10 @@ def print_comparisons(console: Console, comparisons: Sequence[Comparison]) -> No
         cells += [f"{a.noise_floor:.3f}", ""]
     table.add_row(*cells, *([""] * len(first.horizons)), style="dim")
     console.print(table)
+    told = "expl.: share of the linear model's squared error above the noise floor that is explained"
+    if first.horizons:
+        told += "; times: position error of an open-loop prediction that long"
+    console.print(told, style="dim")
     share = float(first.used.mean())
     if share < 0.95:
         console.print(
@@ -139,17 +142,17 @@ def print_waterfall(
 ) -> None:
     """The error falling over the model versions, with bars."""
     table = Table(title="residual RMS in m/s² as effects are added", title_justify="left")
-    table.add_column("model")
+    table.add_column("model", no_wrap=True)
     table.add_column(f"fitted: {fitted}", justify="right")
     if held_out:
         table.add_column(f"held out: {held_out}", justify="right")
-    table.add_column("")
+    table.add_column("", no_wrap=True)
     most = max(s.fitted for s in steps)
     for s in steps:
         cells = [s.label, f"{s.fitted:.3f}"]
         if held_out:
             cells.append("" if s.held_out is None else f"{s.held_out:.3f}")
-        table.add_row(*cells, Text("█" * max(1, round(30 * s.fitted / most)), style="red"))
+        table.add_row(*cells, Text("█" * max(1, round(24 * s.fitted / most)), style="red"))
     cells = ["noise floor", f"{steps[-1].noise_floor:.3f}"] + ([""] if held_out else [])
-    table.add_row(*cells, Text("█" * round(30 * steps[-1].noise_floor / most), style="dim"), style="dim")
+    table.add_row(*cells, Text("█" * round(24 * steps[-1].noise_floor / most), style="dim"), style="dim")
     console.print(table)

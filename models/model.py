@@ -56,8 +56,8 @@ class Model:
     @property
     def label(self) -> str:
         """What people see: version and what was added last."""
-        last = "linear" if not self.terms else self.terms[-1].effect
-        return f"v{self.version} {'+ ' if len(self.terms) > 1 else ''}{last}"
+        last = "linear" if not self.terms else f"+ {self.terms[-1].effect}"
+        return f"v{self.version} {last}" if self.version else last
 
 
 def linear_model(vehicle: Vehicle) -> Model:
