@@ -172,7 +172,7 @@ def fly(
         Path | None, typer.Option(help="Design file; otherwise design.json beside the vehicle.")
     ] = None,
     parameter: Annotated[
-        list[str] | None, typer.Option("--parameter", "-p", help="Of the trajectory, NAME=VALUE. Repeatable.")
+        list[str] | None, typer.Option("--set", help="Parameter of the trajectory, NAME=VALUE. Repeatable.")
     ] = None,
     model: Annotated[
         Path | None, typer.Option(help="ONNX model; the guarded correction then flies with it.")
@@ -245,7 +245,7 @@ def _trajectory(name: str, assignments: list[str]) -> Any:
     for assignment in assignments:
         key, equals, value = assignment.partition("=")
         if not equals:
-            raise InputError(f"--parameter {assignment}: write NAME=VALUE")
+            raise InputError(f"--set {assignment}: write NAME=VALUE")
         parameters[key] = value
     return trajectory(name, **parameters)
 

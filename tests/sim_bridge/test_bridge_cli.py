@@ -70,7 +70,7 @@ def test_a_damaged_seal_is_told_in_one_line(vehicle: Vehicle, tmp_path: Path, da
 
 def test_fly_writes_a_record_and_seals_the_answer(tmp_path: Path) -> None:
     design = ("--design", str(QUAD5 / "design.json"))
-    fly = ("fly", "--trajectory", "hover", "-p", "duration=2", *VEHICLE, *design, "-o", "one.mcap")
+    fly = ("fly", "--trajectory", "hover", "--set", "duration=2", *VEHICLE, *design, "-o", "one.mcap")
     done = command(*fly, "--hidden", "random", "--seed", "7", "--csv", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
