@@ -153,7 +153,9 @@ class _Search:
         """The base model with `added`, all of `added` fitted."""
         key = frozenset(added)
         if key not in self._states:
-            terms = [*self.base.terms, *(Term(n, {}) for n in added)]
+            near = max((k for k in self._states if k <= key), key=len, default=frozenset())
+            start = {t.effect: t.values for t in self._states[near].fit.terms} if near else {}
+            terms = [*self.base.terms, *(Term(n, start.get(n, {})) for n in added)]
             fitted = fit(self.problem, terms, refit=list(added))
             self._states[key] = _State(tuple(added), fitted, block_errors(fitted, self.blocks))
         return self._states[key]

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import optimize, stats
 from statsmodels.stats.sandwich_covariance import S_hac_simple
 
 from groundstation.measurement import Measurement
-from models.effect import Effect, Parameter, Stage
+from models.effect import Effect, Motion, Parameter, Stage
 from models.effects import effect_named
 from models.model import Model, Term
 from models.prediction import Chain, act, motion_of_flight, specific_force
@@ -67,10 +68,14 @@ class Problem:
     def predict(self, chain: Sequence[tuple[Effect, Mapping[str, float]]]) -> np.ndarray:
         """Predicted specific force (K, A) of the used samples of all flights, behind each flight's filter."""
         parts = []
-        for m in self.measurements:
-            force = m.see(specific_force(act(motion_of_flight(m.flight), chain)))
+        for m, motion in zip(self.measurements, self._motions, strict=True):
+            force = m.see(specific_force(act(motion, chain)))
             parts.append(force[m.used][:, m.axes])
         return np.concatenate(parts)
+
+    @cached_property
+    def _motions(self) -> tuple[Motion, ...]:
+        return tuple(motion_of_flight(m.flight) for m in self.measurements)
 
     def measured(self) -> np.ndarray:
         """Measured specific force (K, A) of the used samples."""

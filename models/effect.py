@@ -59,6 +59,14 @@ class Motion:
     tau: float = 0.0
     delay: float = 0.0
 
+    @property
+    def body_velocity(self) -> tuple[Array, Array, Array]:
+        """Velocity relative to the air along the body's axes, three (N,), m/s."""
+        r, v = self.rotation, self.air_velocity
+        x, y, z = v[:, 0], v[:, 1], v[:, 2]
+        # written out: a batch of small products is slow in every array library
+        return tuple(r[:, 0, j] * x + r[:, 1, j] * y + r[:, 2, j] * z for j in range(3))  # type: ignore[return-value]
+
     def with_(self, **changes: Any) -> Motion:
         """A copy with some fields changed."""
         return replace(self, **changes)

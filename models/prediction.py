@@ -126,8 +126,9 @@ def linear_thrust(motion: Motion) -> Array:
 
 def to_heading(motion: Motion, body: Array) -> Array:
     """Body vectors (N, 3) in the heading frame."""
-    xp = array_namespace(motion.thrust)
-    return xp.sum(motion.rotation * body[:, None, :], axis=2)
+    xp, r = array_namespace(motion.thrust), motion.rotation
+    x, y, z = body[:, 0], body[:, 1], body[:, 2]
+    return xp.stack([r[:, i, 0] * x + r[:, i, 1] * y + r[:, i, 2] * z for i in range(3)], axis=-1)
 
 
 def acceleration(motion: Motion) -> Array:
@@ -141,7 +142,8 @@ def specific_force(motion: Motion) -> np.ndarray:
     """What the accelerometer reads (N, 3), body axes, m/s²; without attitude, thrust along the body's z axis."""
     if motion.rotation is None:
         return motion.force + motion.reading + np.outer(motion.thrust, [0.0, 0.0, 1.0])
-    thrust = np.einsum("nji,nj->ni", motion.rotation, motion.thrust_acceleration)
+    r, (x, y, z) = motion.rotation, motion.thrust_acceleration.T
+    thrust = np.stack([r[:, 0, j] * x + r[:, 1, j] * y + r[:, 2, j] * z for j in range(3)], axis=-1)
     return thrust + motion.force + motion.reading
 
 

@@ -8,11 +8,9 @@ from models.effect import Array, Effect, Motion, Parameter, Stage
 def formula(motion: Motion, *, x: Array, y: Array, z: Array) -> Motion:
     """`a = -diag(x, y, z) v_air |v_air|`, body axes; `x`, `y`, `z` in 1/m are `rho C_d A / 2 m` of each face."""
     xp = array_namespace(motion.thrust)
-    velocity = xp.sum(motion.rotation * motion.air_velocity[:, :, None], axis=1)
-    speed = xp.sqrt(xp.sum(velocity * velocity, axis=-1) + 1e-12)
-    force = xp.stack(
-        [-x * velocity[:, 0] * speed, -y * velocity[:, 1] * speed, -z * velocity[:, 2] * speed], axis=-1
-    )
+    ahead, left, up = motion.body_velocity
+    speed = xp.sqrt(ahead * ahead + left * left + up * up + 1e-12)
+    force = xp.stack([-x * ahead * speed, -y * left * speed, -z * up * speed], axis=-1)
     return motion.with_(force=motion.force + force)
 
 

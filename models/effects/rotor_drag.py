@@ -12,12 +12,9 @@ def formula(motion: Motion, *, x: Array, y: Array) -> Motion:
     `x`, `y` in 1/s are the values at hover thrust.
     """
     xp = array_namespace(motion.thrust)
-    # R^T v: velocity relative to the air in body axes
-    velocity = xp.sum(motion.rotation * motion.air_velocity[:, :, None], axis=1)
+    ahead, left, _ = motion.body_velocity
     rotor_speed = xp.sqrt(xp.clip(motion.thrust, 0.0, None) / GRAVITY)
-    force = xp.stack(
-        [-x * velocity[:, 0] * rotor_speed, -y * velocity[:, 1] * rotor_speed, 0.0 * velocity[:, 2]], axis=-1
-    )
+    force = xp.stack([-x * ahead * rotor_speed, -y * left * rotor_speed, 0.0 * ahead], axis=-1)
     return motion.with_(force=motion.force + force)
 
 
