@@ -137,6 +137,7 @@ class Companion:
         if step is not None:
             self.link.send_rates(odometry.vehicle_time_us, step.thrust_command, step.command.body_rate)
         latency = 1e-9 * (time.monotonic_ns() - odometry.host_time_ns)
+        self.flight.watch(latest)
         self._vehicle_time_us = odometry.vehicle_time_us
         data = make_tick(odometry, latest, outcome, latency).SerializeToString()
         recorder = self.director.recorder

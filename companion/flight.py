@@ -140,6 +140,7 @@ class Flight:
     _low_since: float = math.inf
     _yaw: float = 0.0
     _sending: bool = False
+    _unwatched: tuple[Odometry, Odometry | None, Outcome] | None = None
     _here: Waypoint = (0.0, 0.0, 0.0, 0.0)
 
     # Orders
@@ -206,11 +207,22 @@ class Flight:
 
     def tick(self, odometry: Odometry, latest: Latest) -> Outcome:
         """Decide what to send for this odometry message."""
+        previous = self._previous
         out = self._decide(odometry, latest)
         self._sending = out.step is not None
         self.ticked += 1
+        self._unwatched = (odometry, previous, out)
         self.sent += self._sending
         return out
+
+    def watch(self, latest: Latest) -> None:
+        """Look for reasons to end the flight in the odometry of the last `tick`.
+
+        Called after its setpoint has left, so that it costs no latency; what it finds acts on the next tick.
+        """
+        if self._unwatched is not None and self._leg is not None and self.phase not in (IDLE, SILENT):
+            odometry, previous, out = self._unwatched
+            self._watch(odometry, previous, out.interval, out.position, latest)
 
     def _decide(self, odometry: Odometry, latest: Latest) -> Outcome:
         previous, self._previous = self._previous, odometry
@@ -231,8 +243,6 @@ class Flight:
         if self.phase == IDLE:
             return out
         self._watch_mode(latest)
-        if self._leg is not None and self.phase != SILENT:
-            self._watch(odometry, previous, interval, position, latest)
         out.phase = self.phase
         mission = self.mission
         if mission is None or self.phase in (IDLE, SILENT):

@@ -60,6 +60,7 @@ class Rig:
             0,
         )
         out = self.flight.tick(odometry, self.latest)
+        self.flight.watch(self.latest)
         if out.step is not None and self.latest.armed:
             dt, command = 1e-6 * DT_US, out.step.command
             self.tilt = [self.tilt[0] + dt * command.body_rate[0], self.tilt[1] + dt * command.body_rate[1]]
