@@ -1,0 +1,159 @@
+"""A hidden effect is found by name, with its size, and nothing is found where nothing is hidden."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from groundstation.diagnosis import Diagnosis, diagnose
+from groundstation.reading import read_flight
+from models.model import Term, rigid_body_model
+
+ROOT = Path(__file__).parents[2]
+SAMPLES = ROOT / "samples"
+VEHICLE = ROOT / "models" / "vehicles" / "quad5" / "vehicle.toml"
+BIN = Path(sys.executable).parent
+
+
+def fly(tmp_path: Path, *arguments: str) -> Path:
+    """A simulated survey flight, by the simulator's own program."""
+    record = tmp_path / "flight.mcap"
+    command = [BIN / "sim-bridge", "fly", "--trajectory", "excitation", "--vehicle", VEHICLE, "-o", record]
+    subprocess.run([*map(str, command), *arguments], check=True, capture_output=True, timeout=120)
+    return record
+
+
+def diagnosis_of(path: Path) -> Diagnosis:
+    flight = read_flight(path)
+    return diagnose(flight, rigid_body_model(flight.vehicle))
+
+
+# What the simulator hides, in its own terms, and what must be found: (name, parameter, value, tolerance).
+# Its ground effect has another law (images of all rotors), so only the name is asked for.
+HIDDEN = [
+    ("thrust_gain:1.08", "thrust_gain", "gain", 1.08, 0.005),
+    ("thrust_curve:0.6", "thrust_curve", "curvature", 0.6, 0.03),
+    ("battery_sag:1.3", "battery_sag", "exponent", 1.3, 0.1),
+    ("motor_lag:0.05", "motor_lag", "tau", 0.05, 0.005),
+    ("transport_delay:0.03", "transport_delay", "delay", 0.005 + 0.03, 0.01),
+    ("rotor_drag:0.25", "rotor_drag", "x", 0.25, 0.025),
+    ("parasitic_drag:0.1", "parasitic_drag", "x", 0.1, 0.01),
+    ("ground_effect:1.6", "ground_effect", "rho", None, None),
+    ("accelerometer_bias:0.3", "accelerometer_bias", "x", None, None),
+]
+
+
+@pytest.mark.parametrize(
+    ("hidden", "name", "parameter", "value", "tolerance"), HIDDEN, ids=[h[1] for h in HIDDEN]
+)
+def test_hidden_effect_is_found(tmp_path, hidden, name, parameter, value, tolerance) -> None:
+    result = diagnosis_of(fly(tmp_path, "--hidden", hidden, "--seed", "11"))
+    assert result.named("missing") == (name,)
+    assert result.rms_after < 1.25 * result.noise_floor < result.rms_before
+    found = {p.name: p for p in result.effects[1].parameters}[parameter]
+    assert found.low < found.value < found.high
+    if value is not None:
+        assert found.value == pytest.approx(value, abs=tolerance)
+
+
+def test_wind_is_found_with_the_drag_it_acts_through(tmp_path) -> None:
+    result = diagnosis_of(fly(tmp_path, "--hidden", "wind:4", "--seed", "5"))
+    assert set(result.named("missing")) == {"rotor_drag", "wind"}
+
+
+@pytest.mark.parametrize("seed", ["1", "2", "3"])
+def test_nothing_hidden_gives_no_alarm(tmp_path, seed: str) -> None:
+    result = diagnosis_of(fly(tmp_path, "--hidden", "none", "--seed", seed))
+    assert result.named("missing") == result.named("possible") == ()
+    assert not result.unexplained.verdict
+
+
+@pytest.mark.parametrize(("case", "missing"), [("rotor_drag", ("rotor_drag",)), ("nothing_hidden", ())])
+def test_flights_of_another_simulator(case: str, missing: tuple[str, ...]) -> None:
+    folder = SAMPLES / "rotorpy" / case
+    flight = read_flight(folder / "identify.parquet")
+    result = diagnose(flight, rigid_body_model(flight.vehicle), read_flight(folder / "validate.parquet"))
+    assert result.named("missing") == missing
+    assert result.named("possible") == ()
+    assert result.validation_after < 1.05 * result.noise_floor
+
+
+@pytest.mark.parametrize(
+    ("file", "gain"), [("crazyswarm2_log08.csv", 1.44), ("crazyswarm2_log201.csv", 0.0369 / 0.0406)]
+)
+def test_real_crazyflies_thrust_gain_and_drag(file: str, gain: float) -> None:
+    # gains: the least-squares study of the same flights that samples/README.md tells of
+    result = diagnosis_of(SAMPLES / "crazyflie" / file)
+    assert result.named("missing")[:2] == ("thrust_gain", "rotor_drag")
+    found = next(e for e in result.effects if e.name == "thrust_gain")
+    assert found.parameters[0].value == pytest.approx(gain, rel=0.01)
+    assert "mass" in found.indistinguishable_from
+
+
+def test_included_effect_is_not_looked_for_again() -> None:
+    flight = read_flight(SAMPLES / "rotorpy" / "rotor_drag" / "identify.parquet")
+    base = rigid_body_model(flight.vehicle)
+    base = base.with_terms((*base.terms, Term("rotor_drag", {"x": 0.2, "y": 0.2})))
+    result = diagnose(flight, base)
+    assert [e.verdict for e in result.effects if e.name == "rotor_drag"] == ["included"]
+    assert result.named("missing") == ()
+
+
+def test_hover_cannot_show_drag_and_says_what_would() -> None:
+    flight = read_flight(SAMPLES / "rotorpy" / "rotor_drag" / "identify.parquet")
+    n = len(flight)
+    rng = np.random.default_rng(0)
+    hover = replace(
+        flight,
+        position=np.tile([0.0, 0.0, 1.5], (n, 1)),
+        velocity=rng.normal(0, 0.02, (n, 3)),
+        quaternion=np.tile([1.0, 0, 0, 0], (n, 1)),
+        angular_velocity=np.zeros((n, 3)),
+        body_rate_command=np.zeros((n, 3)),
+        thrust_command=np.full(n, flight.vehicle.hover_thrust),
+        specific_force=rng.normal(0, 0.1, (n, 3)) + [0.0, 0.0, 9.81],
+    )
+    result = diagnose(hover, rigid_body_model(flight.vehicle))
+    verdicts = {e.name: e for e in result.effects}
+    assert result.named("missing") == ()
+    for name in ("rotor_drag", "parasitic_drag", "thrust_curve", "motor_lag", "ground_effect", "battery_sag"):
+        assert verdicts[name].verdict == "not_excited", name
+        assert "fly" in verdicts[name].advice
+
+
+def test_json_has_the_agreed_shape() -> None:
+    folder = SAMPLES / "rotorpy" / "rotor_drag"
+    out = subprocess.run(
+        [
+            BIN / "groundstation",
+            "diagnose",
+            folder / "identify.parquet",
+            "--validate",
+            folder / "validate.parquet",
+        ]
+        + ["--vehicle", folder / "vehicle.toml", "--store", folder / "no-such-store", "--json"],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    table = json.loads(out.stdout)
+    assert set(table["residual_rms"]) == {"before", "after", "noise_floor", "unit"}
+    assert table["residual_rms"]["unit"] == "m/s^2"
+    assert table["validation_rms"]["after"] < table["validation_rms"]["before"]
+    first = next(e for e in table["effects"] if e["rank"] == 1)
+    assert first["name"] == "rotor_drag"
+    assert first["verdict"] == "missing"
+    assert set(first["parameters"]["x"]) == {"value", "low", "high", "unit"}
+    assert {e["verdict"] for e in table["effects"]} <= {
+        "missing",
+        "possible",
+        "not_supported",
+        "not_excited",
+        "included",
+    }
+    assert set(table["unexplained"]) == {"verdict", "variance_share", "where"}
