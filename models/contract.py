@@ -35,7 +35,9 @@ KEY_FEATURES = "features"  # [{"name", "unit", "low", "high"}], the range seen i
 KEY_CHAIN = "chain"  # [{"effect": name, "parameters": {name: value}}], in order
 KEY_DATA_HASH = "data_hash"
 KEY_GOLDEN_FEATURES = "golden_features"  # [[F floats] x at least 3]
-KEY_GOLDEN_DELTA = "golden_delta"  # [[3 floats] x as many]; the companion evaluates them again, within GOLDEN_TOLERANCE
+KEY_GOLDEN_DELTA = (
+    "golden_delta"  # [[3 floats] x as many]; the companion evaluates them again, within GOLDEN_TOLERANCE
+)
 REQUIRED_KEYS = (
     KEY_CONTRACT,
     KEY_NAME,

@@ -138,7 +138,9 @@ class Flight:
     def part(self, where: slice | np.ndarray) -> Flight:
         """The flight restricted to some of its samples (a slice or a boolean mask (N,))."""
         changes: dict[str, object] = {
-            name: getattr(self, name)[where] for name in (*COLUMNS, "t", "flying") if getattr(self, name) is not None
+            name: getattr(self, name)[where]
+            for name in (*COLUMNS, "t", "flying")
+            if getattr(self, name) is not None
         }
         changes["extra"] = {name: column[where] for name, column in self.extra.items()}
         return replace(self, **changes)  # type: ignore[arg-type]

@@ -81,7 +81,9 @@ def load_vehicle(path: str | Path) -> Vehicle:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{path}: cannot read the vehicle file ({error.strerror}); pass --vehicle FILE") from None
+        raise InputError(
+            f"{path}: cannot read the vehicle file ({error.strerror}); pass --vehicle FILE"
+        ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not valid TOML: {error}; correct that line") from None
     return vehicle_from_table(table, str(path))
@@ -114,7 +116,9 @@ def vehicle_from_table(table: dict[str, object], where: str) -> Vehicle:
             f"{where}: thrust_model is '{vehicle.thrust_model}'; it must be one of {', '.join(THRUST_MODELS)}"
         )
     if "/" in vehicle.name or "*" in vehicle.name or " " in vehicle.name:
-        raise InputError(f"{where}: name '{vehicle.name}' must not hold '/', '*' or blanks (it is part of a Zenoh key)")
+        raise InputError(
+            f"{where}: name '{vehicle.name}' must not hold '/', '*' or blanks (it is part of a Zenoh key)"
+        )
     if len(vehicle.rotor_positions) != len(vehicle.rotor_directions):
         raise InputError(
             f"{where}: {len(vehicle.rotor_positions)} rotor_positions but {len(vehicle.rotor_directions)} "
@@ -128,7 +132,9 @@ def _number(where: str, key: str, value: object) -> float:
         raise InputError(f"{where}: '{key}' must be a number, not {value!r}")
     low, high, unit = _RANGES[key]
     if not low <= value <= high:
-        raise InputError(f"{where}: {key} = {value:g} is outside {low:g} to {high:g} {unit}; check value and unit")
+        raise InputError(
+            f"{where}: {key} = {value:g} is outside {low:g} to {high:g} {unit}; check value and unit"
+        )
     return float(value)
 
 
@@ -138,7 +144,9 @@ def _array(where: str, key: str, value: object) -> object:
     except (TypeError, ValueError):
         raise InputError(f"{where}: '{key}' must be an array of numbers, not {value!r}") from None
     if key == "inertia":
-        if array.shape != (3,) or not (np.all(np.isfinite(array)) and np.all(array >= 0) and np.all(array < 100)):
+        if array.shape != (3,) or not (
+            np.all(np.isfinite(array)) and np.all(array >= 0) and np.all(array < 100)
+        ):
             raise InputError(f"{where}: 'inertia' must be three diagonal moments in kg m^2, each 0 to 100")
         return tuple(float(x) for x in array)
     if key == "rotor_positions":
