@@ -41,8 +41,10 @@ def _blueprint(
         flying = np.ones(len(flight), bool) if flight.flying is None else flight.flying
         measured = np.where(flying, comparisons[0].measured[:, axis], np.nan)
         curve(stream, f"acceleration/{name}/measured", flight.t, measured, "measured", MEASURED, 3.0)
+        values = [measured]
         for index, c in _drawn(comparisons):
             predicted = np.where(flying, c.predicted[:, axis], np.nan)
+            values.append(predicted)
             curve(
                 stream,
                 f"acceleration/{name}/v{index}",
@@ -56,7 +58,7 @@ def _blueprint(
                 origin=f"acceleration/{name}",
                 name=f"{name} ({AXES[axis]}) acceleration, m/s², below {comparisons[0].bandwidth:g} Hz",
                 axis_x=rrb.TimeAxis(view_range=between(start, start + WINDOW)),
-                axis_y=rrb.ScalarAxis(range=_range(measured)),
+                axis_y=rrb.ScalarAxis(range=_range(values, flight.t, start)),
                 plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=axis == shown[0]),
             )
         )
@@ -108,9 +110,13 @@ def _window(t: np.ndarray, where: WhereItFails | None) -> float:
     return float(np.clip(middle - 0.5 * WINDOW, t[0], max(t[0], t[-1] - WINDOW)))
 
 
-def _range(values: np.ndarray) -> tuple[float, float]:
-    low, high = np.nanquantile(values, [0.002, 0.998])
-    margin = 0.15 * max(high - low, 0.5)
+def _range(curves: Sequence[np.ndarray], t: np.ndarray, start: float) -> tuple[float, float]:
+    """Lowest and highest of all curves in the first window, with a margin."""
+    inside = (t >= start) & (t <= start + WINDOW)
+    shown = np.concatenate([values[inside] for values in curves])
+    shown = shown[np.isfinite(shown)] if np.any(np.isfinite(shown)) else np.zeros(1)
+    low, high = np.quantile(shown, [0.001, 0.999])
+    margin = 0.1 * max(high - low, 0.5)
     return float(low - margin), float(high + margin)
 
 

@@ -177,6 +177,7 @@ def state(vehicle: str, tick: Tick | None, silent: float) -> str:
         f"| guard | {f'**{guard}**' if guard.startswith('tripped') else guard} |",
         f"| battery | {tick.battery_voltage:.1f} V |",
         f"| height | {tick.position.z:.1f} m |",
+        f"| latency | {1e3 * tick.latency:.1f} ms |",
     ]
     return "\n".join(lines)
 
@@ -189,14 +190,9 @@ def blueprint() -> rrb.Blueprint:
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
 
-    def curves(origin: str, name: str, legend: bool = True, **options: object) -> rrb.TimeSeriesView:
-        return rrb.TimeSeriesView(
-            origin=origin,
-            name=name,
-            time_ranges=now,
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
-            **options,
-        )
+    def curves(origin: str, name: str) -> rrb.TimeSeriesView:
+        legend = rrb.PlotLegend(visible=False)
+        return rrb.TimeSeriesView(origin=origin, name=name, time_ranges=now, plot_legend=legend)
 
     space = rrb.Spatial3DView(
         origin="space",
@@ -212,19 +208,28 @@ def blueprint() -> rrb.Blueprint:
                 rrb.Horizontal(
                     rrb.TextDocumentView(origin="state", name="state"), space, column_shares=[1, 2.2]
                 ),
-                rrb.TextLogView(origin="events", name="events"),
+                rrb.TextLogView(
+                    origin="events",
+                    name="events",
+                    columns=rrb.TextLogColumns(
+                        timeline_columns=[TIME], text_log_columns=["loglevel", "body"]
+                    ),
+                ),
                 row_shares=[4, 1],
             ),
             rrb.Vertical(
-                curves("position/x", "x (m)"),
-                curves("position/y", "y (m)", False),
-                curves("position/z", "height z (m)", False),
-                curves("thrust", "thrust command (hover = 1)"),
-                curves("rates", "body rates sent (deg/s)"),
-                curves("correction", "correction (m/s²)"),
+                curves("position/x", "x (m): flown blue, reference green"),
+                curves("position/y", "y (m)"),
+                curves("position/z", "height z (m)"),
                 rrb.Horizontal(
-                    curves("latency", "latency (ms)"),
-                    curves("battery", "battery (V)", False),
+                    curves("thrust/feedback", "thrust wanted by the linear cascade (N)"),
+                    curves("thrust/sent", "thrust sent (1 is full)"),
+                ),
+                curves("rates", "body rates sent (deg/s): roll red, pitch green, yaw blue"),
+                curves("correction", "correction (m/s²): x red, y green, z blue"),
+                rrb.Horizontal(
+                    curves("latency", "latency (ms), model orange"),
+                    curves("battery", "battery (V)"),
                 ),
             ),
             column_shares=[5, 4],

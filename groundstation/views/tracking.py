@@ -27,10 +27,10 @@ def _blueprint(stream: rr.RecordingStream, tracked: Sequence[Tracking]) -> rrb.B
     positions = np.concatenate([t.position for t in tracked])
     size = scene.extent(positions)
     stream.log("space", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    scene.log_line(stream, "space/expected", tracked[-1].expected, EXPECTED, 0.003 * size)
     for index, t in enumerate(tracked):
         colour = of_version(index, count) if count > 1 else NEWEST
         scene.log_line(stream, f"space/flight{index}", t.position, colour, 0.004 * size)
+        scene.log_line(stream, f"space/expected{index}", t.expected, EXPECTED, 0.003 * size)
         clock = t.t - t.t[0]
         miss = np.linalg.norm(t.position - t.expected, axis=1)
         gaps = np.concatenate([[False], np.diff(clock) > 0.2])
