@@ -43,8 +43,9 @@ class GuardLimits:
     `authority` m/s² and `slew` m/s³ per axis of the heading frame. A raw value beyond `absurd` times the
     authority trips; one beyond the authority is cut and trips after `patience` s without a pause. Outside the
     training range the correction is scaled down, to nothing at `margin` times the range's width, and trips
-    after `patience` s beyond. `deadline` s for one inference: `misses` late ones in a row trip, as does one
-    `misses` times too late. `fade` s from nothing to full effect and back.
+    after `patience` s beyond. `deadline` s for one inference: `misses` late ones in a row trip, as does a single
+    one of more than `stall` s. One late inference alone says more of the operating system than of the model.
+    `fade` s from nothing to full effect and back.
     """
 
     authority: Vector = (3.0, 3.0, 4.0)
@@ -54,6 +55,7 @@ class GuardLimits:
     patience: float = 1.0
     deadline: float = 0.002
     misses: int = 5
+    stall: float = 0.05
     fade: float = 1.0
 
 
@@ -166,7 +168,7 @@ class Guard:
 
     def _in_time(self, seconds: float) -> bool:
         self._late = self._late + 1 if seconds > self.limits.deadline else 0
-        return self._late < self.limits.misses and seconds <= self.limits.deadline * self.limits.misses
+        return self._late < self.limits.misses and seconds <= self.limits.stall
 
     def _trust(self, features: Sequence[float]) -> tuple[float, str]:
         """1 inside the training range, falling to 0 across the margin around it, and the feature that

@@ -276,9 +276,7 @@ def _analyse(
     recordings = tuple(folder / f"{n}.rrd" for n in ("comparison", "where", "before-after"))
     write_comparison(recordings[0], [compare(fitted, m) for m in line], where_it_fails(after))
     write_where(recordings[1], before, where)
-    write_before_after(
-        recordings[2], [compare(fitted, m) for m in line], [compare(held_out, m) for m in line], steps
-    )
+    write_before_after(recordings[2], [(m, fitted, held_out) for m in line], steps)
     return model, diagnosis, before, after, recordings
 
 

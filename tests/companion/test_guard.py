@@ -211,7 +211,7 @@ def test_a_late_model_trips_after_some_misses_and_a_very_late_one_at_once() -> N
 
     at_once = guard_of(model, clock=clock)
     at_once.start()
-    delay[0] = 1.1 * LIMITS.deadline * LIMITS.misses
+    delay[0] = 1.1 * LIMITS.stall
     at_once.step(INSIDE, DT)
     assert at_once.tripped
 
