@@ -171,7 +171,8 @@ def check_specific_force(columns: dict[str, np.ndarray], flying: np.ndarray, ori
         return
     x, y, z = np.median(f[flying], axis=0)
     norm = float(np.median(np.linalg.norm(f[flying], axis=1)))
-    if 0.5 < norm < 2.5 and abs(z) > 0.5:
+    spread = float(np.subtract(*np.quantile(f[flying, 2], [0.75, 0.25])))
+    if 0.5 < norm < 2.0 and abs(z) > 0.8 * norm and spread < 0.5 * norm:
         raise InputError(
             f"{origin}: specific_force is {norm:.2f} m/s^2 in flight, which looks like g; convert it to "
             "m/s^2, "

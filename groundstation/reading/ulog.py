@@ -7,6 +7,8 @@ analysed.
 
 from __future__ import annotations
 
+import contextlib
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,7 +118,9 @@ def _load(path: Path) -> tuple[dict[str, Topic], list[str]]:
     from pyulog import ULog
 
     try:
-        log = ULog(str(path), message_name_filter_list=list(TOPICS))
+        # pyulog prints what it meets in a damaged file; we tell it ourselves.
+        with contextlib.redirect_stdout(io.StringIO()):
+            log = ULog(str(path), message_name_filter_list=list(TOPICS))
     except OSError as error:
         raise InputError(f"{path}: cannot read the log ({error.strerror or error}); check the path") from None
     except Exception as error:  # noqa: BLE001 - pyulog lets through whatever its parser meets
@@ -136,7 +140,8 @@ def _load(path: Path) -> tuple[dict[str, Topic], list[str]]:
         notes.append("parts of the log are damaged and were skipped")
     if not topics:
         raise InputError(
-            f"{path}: the log holds none of the topics of a flight; log with PX4's default profile"
+            f"{path}: the log holds none of the topics of a flight (cut short?); log with PX4's default "
+            "profile"
         )
     return topics, notes
 
