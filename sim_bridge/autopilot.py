@@ -140,6 +140,18 @@ class Autopilot:
             self._target = MotionSetpoint((x, y, z + height), yaw=self._target.yaw)
         return Verdict.ACCEPTED
 
+    def reposition(self, position: Vector, yaw: float) -> Verdict:
+        """Go to a position (m, world) with a yaw (rad) and hold; NaN keeps what is. Denied on the ground."""
+        if not self.armed or self.landed is Landed.ON_GROUND:
+            return Verdict.DENIED
+        self._enter(Mode.HOLD)
+        x, y, z = (
+            new if math.isfinite(new) else old
+            for new, old in zip(position, self._target.position, strict=True)
+        )
+        self._target = MotionSetpoint((x, y, z), yaw=self._target.yaw if math.isnan(yaw) else yaw)
+        return Verdict.ACCEPTED
+
     def arming_refusals(self) -> list[str]:
         """Why arming is denied now; empty when it is not."""
         reasons = []

@@ -78,7 +78,8 @@ class Commands:
         if not 0.5 < norm < 2.0:
             return ()
         w, x, y, z = (component / norm for component in q)
-        turn = 0.0 if mask & mav.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE else rates[2]
+        ignored = mask & mav.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE or not math.isfinite(rates[2])
+        turn = 0.0 if ignored else rates[2]
         self.autopilot.offboard(AttitudeSetpoint(thrust, wire.attitude((w, x, y, z)), turn))
         return ()
 
@@ -119,8 +120,11 @@ class Commands:
             yaw_now = yaw_of(self.autopilot.simulator.estimate().quaternion)
             velocity = _turned(message.vx, -message.vy, -message.vz, yaw_now)
             acceleration = _turned(message.afx, -message.afy, -message.afz, yaw_now)
-        yaw = _NAN if mask & mav.POSITION_TARGET_TYPEMASK_YAW_IGNORE else wire.heading(message.yaw)
-        yaw_rate = _NAN if mask & mav.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE else -message.yaw_rate
+        yaw = yaw_rate = _NAN
+        if not mask & mav.POSITION_TARGET_TYPEMASK_YAW_IGNORE and math.isfinite(message.yaw):
+            yaw = wire.heading(message.yaw)
+        if not mask & mav.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE and math.isfinite(message.yaw_rate):
+            yaw_rate = -message.yaw_rate
         self.autopilot.offboard(
             MotionSetpoint(
                 unmasked(position, 0), unmasked(velocity, 3), unmasked(acceleration, 6), yaw, yaw_rate
@@ -130,7 +134,11 @@ class Commands:
     # Commands
 
     def _command_int(self, message: Any, peer: Peer) -> Reply:
-        return self._command(message, peer, (message.x, message.y, message.z))
+        if message.command != mav.MAV_CMD_DO_REPOSITION:
+            return self._command(message, peer, (message.x, message.y, message.z))
+        # Latitude and longitude; the largest negative number says that there is none.
+        x, y = (_NAN if degrees == -(2**31) else degrees * 1e-7 for degrees in (message.x, message.y))
+        return self._command(message, peer, (x, y, message.z))
 
     def _command_long(self, message: Any, peer: Peer) -> Reply:
         return self._command(message, peer, (message.param5, message.param6, message.param7))
@@ -156,6 +164,9 @@ class Commands:
             altitude = place[2]
             height = altitude - wire.ORIGIN[2] - a.simulator.estimate().position[2]
             return a.takeoff(height if math.isfinite(altitude) and height > 0.2 else None), []
+        if command == mav.MAV_CMD_DO_REPOSITION:
+            yaw = wire.heading(m.param4) if math.isfinite(m.param4) else _NAN
+            return a.reposition(wire.local(*place), yaw), []
         if command == mav.MAV_CMD_NAV_LAND:
             return a.set_mode(Mode.LAND), []
         if command == mav.MAV_CMD_NAV_RETURN_TO_LAUNCH:

@@ -42,6 +42,10 @@ def takeoff_and_land(drone: System) -> dict[str, object]:
     action.arm()
     action.takeoff()
     wait(lambda: telemetry.position().relative_altitude_m > 2.0)
+    home = telemetry.home()
+    north = home.latitude_deg + math.degrees(3.0 / 6371000.0)
+    action.goto_location(north, home.longitude_deg, home.absolute_altitude_m + 3.0, 0.0)
+    wait(lambda: telemetry.position_velocity_ned().position.north_m > 2.7)
     action.land()
     wait(lambda: not telemetry.armed())
     return {"altitudes": altitudes, "end": telemetry.position().relative_altitude_m}

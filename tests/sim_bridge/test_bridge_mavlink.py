@@ -77,6 +77,10 @@ class Client:
             0, 1, 1, mav.MAV_FRAME_LOCAL_NED, mask, north, east, down, 0, 0, 0, 0, 0, 0, yaw, 0
         )
 
+    def estimator(self) -> None:
+        """Wait until the vehicle's clock is past the start of its estimator, before which arming is denied."""
+        self.wait(lambda m: m.get_type() == "ODOMETRY" and m.time_usec > 1_100_000)
+
     def close(self) -> None:
         self.link.close()
 
@@ -97,7 +101,7 @@ def connect(bridge: Callable[..., Bridge]) -> Iterator[Callable[..., tuple[Bridg
 
 def fly_to(client: Client, north: float, east: float, down: float, yaw: float) -> None:
     """Arm, start Offboard with a stream of position setpoints, and wait until the vehicle is there."""
-    client.pump(1.2)
+    client.estimator()
     end = time.monotonic() + 20.0
     client.position(0.0, 0.0, 0.0, yaw)
     assert client.command(mav.MAV_CMD_DO_SET_MODE, 1, 6, 0) == mav.MAV_RESULT_ACCEPTED
@@ -271,5 +275,14 @@ def test_what_is_not_mavlink_is_survived(connect) -> None:
     assert client.wait(lambda m: m.get_type() == "MISSION_COUNT").count == 0
     # Setpoints without sense opened nothing.
     assert client.command(mav.MAV_CMD_DO_SET_MODE, 1, 6, 0) == mav.MAV_RESULT_TEMPORARILY_REJECTED
+    # Infinite targets of a setpoint that is well formed otherwise leave the axis free.
+    client.estimator()
+    infinite = (math.inf,) * 11
+    client.link.mav.set_position_target_local_ned_send(0, 1, 1, mav.MAV_FRAME_LOCAL_NED, 0, *infinite)
+    assert client.command(mav.MAV_CMD_DO_SET_MODE, 1, 6, 0) == mav.MAV_RESULT_ACCEPTED
+    assert client.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1, 0) == mav.MAV_RESULT_ACCEPTED
+    client.pump(0.3)
+    odometry = client.of("ODOMETRY")[-1]
+    assert math.isfinite(odometry.x + odometry.vx + odometry.rollspeed + sum(odometry.q))
     client.link.mav.timesync_send(0, 123)
     assert client.wait(lambda m: m.get_type() == "TIMESYNC").ts1 == 123
