@@ -102,7 +102,8 @@ def _horizons(flight: Flight, motion: Motion, chain: Chain, used: np.ndarray) ->
 
     Restarts whose window is mostly left out of the comparison (saturated rotors) are left out here too.
     """
-    if not flight.has("position", "velocity", "quaternion"):
+    flown, speed, attitude = flight.position, flight.velocity, flight.quaternion
+    if flown is None or speed is None or attitude is None:
         return ()
     dt, n = flight.dt, len(flight)
     longest = round(HORIZONS[-1] / dt)
@@ -118,13 +119,13 @@ def _horizons(flight: Flight, motion: Motion, chain: Chain, used: np.ndarray) ->
     acting = act(motion, [(e, v) for e, v in chain if e.stage == 0])
     base = motion.with_(command=acting.command, thrust=acting.command, tau=0.0, delay=0.0)
     rest = [(e, v) for e, v in chain if e.stage != 0]
-    yaw = euler_from_quaternion(flight.quaternion)[:, 2]  # type: ignore[arg-type]
+    yaw = euler_from_quaternion(attitude)[:, 2]
 
     def world_acceleration(k: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         at = _rows(base, k).with_(height=position[:, 2], air_velocity=heading_from_world(velocity, yaw[k]))
         return world_from_heading(acceleration(act(at, rest)), yaw[k])
 
-    position, velocity = flight.position[starts].copy(), flight.velocity[starts].copy()
+    position, velocity = flown[starts].copy(), speed[starts].copy()
     now = world_acceleration(starts, position, velocity)
     marks = {round(h / dt): h for h in HORIZONS}
     errors = []
@@ -135,8 +136,8 @@ def _horizons(flight: Flight, motion: Motion, chain: Chain, used: np.ndarray) ->
         velocity = velocity + 0.5 * dt * (now + following)
         now = following
         if step in marks:
-            p = np.sqrt(np.mean((position - flight.position[k]) ** 2, axis=0))
-            v = np.sqrt(np.mean((velocity - flight.velocity[k]) ** 2, axis=0))
+            p = np.sqrt(np.mean((position - flown[k]) ** 2, axis=0))
+            v = np.sqrt(np.mean((velocity - speed[k]) ** 2, axis=0))
             errors.append(HorizonError(marks[step], _three(p), _three(v), len(starts)))
     return tuple(errors)
 

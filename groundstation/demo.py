@@ -45,8 +45,8 @@ from models.model import Model, rigid_body_model
 from models.vehicle import Vehicle, load_vehicle
 
 VEHICLE = Path(__file__).parent.parent / "models" / "vehicles" / "quad5" / "vehicle.toml"
-SURVEY = ("excitation", {})
-TASK = ("lemniscate", {"speed": 2.5, "height": 0.8})
+SURVEY: tuple[str, dict[str, float]] = ("excitation", {})
+TASK: tuple[str, dict[str, float]] = ("lemniscate", {"speed": 2.5, "height": 0.8})
 MARK = ".trueflight-demo"
 STARTING = 30.0
 """s that a process may take until it says ready."""

@@ -65,7 +65,7 @@ class Motion:
         r, v = self.rotation, self.air_velocity
         x, y, z = v[:, 0], v[:, 1], v[:, 2]
         # written out: a batch of small products is slow in every array library
-        return tuple(r[:, 0, j] * x + r[:, 1, j] * y + r[:, 2, j] * z for j in range(3))  # type: ignore[return-value]
+        return tuple(r[:, 0, j] * x + r[:, 1, j] * y + r[:, 2, j] * z for j in range(3))
 
     def with_(self, **changes: Any) -> Motion:
         """A copy with some fields changed."""
