@@ -224,7 +224,10 @@ def test_outside_its_training_range_it_is_trusted_less_and_then_not_at_all() -> 
     margin = 0.25 * 2.0
     assert run(guard, 0.5, (2.0 + 0.5 * margin, 0.0))[-1][0] == pytest.approx(0.5)
     assert run(guard, 0.5, (0.0 - 0.5 * margin, 0.0))[-1][0] == pytest.approx(0.5)
+    # Of two features outside, the worse one decides: vx is out by a fifth of its margin of 1 m/s.
+    assert run(guard, 0.5, (2.0 + 0.5 * margin, 2.2))[-1][0] == pytest.approx(0.5)
     assert run(guard, 0.5, (2.0 + 2 * margin, 0.0))[-1][0] == 0.0
+    assert guard.applied == (0.0, 0.0, 0.0)
     assert not guard.tripped
     run(guard, 0.1)  # back inside: forgiven
     run(guard, 0.9, (2.0 + 2 * margin, 0.0))
