@@ -190,8 +190,10 @@ def test_frames_on_the_wire_are_those_of_px4(connect) -> None:
     """At a heading other than north, with all of position, velocity and attitude in play."""
     mav.mavlink_map[ESC_STATUS] = EscStatus
     _, client = connect("--speed", "2", "--noise", "0")
-    for number in (mav.MAVLINK_MSG_ID_ODOMETRY, mav.MAVLINK_MSG_ID_HIGHRES_IMU, mav.MAVLINK_MSG_ID_ATTITUDE):
-        client.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, number, 20_000)
+    wanted = ("ODOMETRY", "HIGHRES_IMU", "ATTITUDE", "BATTERY_STATUS", "EXTENDED_SYS_STATE")
+    for name in wanted:
+        number = getattr(mav, f"MAVLINK_MSG_ID_{name}")
+        assert client.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, number, 20_000) == 0
     fly_to(client, 1.0, -2.0, -2.5, math.radians(120))
     since = len(client.seen)
     for _ in range(12):
@@ -219,13 +221,10 @@ def test_frames_on_the_wire_are_those_of_px4(connect) -> None:
     assert np.mean([message.zacc for message in paired]) == pytest.approx(-9.81, abs=1.0)
     euler = client.of("ATTITUDE", since)[-1]
     assert euler.yaw == pytest.approx(math.radians(120), abs=0.1)
-    battery = client.wait(lambda m: m.get_type() == "BATTERY_STATUS")
+    battery = client.of("BATTERY_STATUS", since)[-1]
     assert sum(v for v in battery.voltages if v != 65535) * 1e-3 == pytest.approx(16.0, rel=0.05)
     assert min(client.of("ESC_STATUS", since)[-1].rpm) > 5000
-    assert (
-        client.wait(lambda m: m.get_type() == "EXTENDED_SYS_STATE").landed_state
-        == mav.MAV_LANDED_STATE_IN_AIR
-    )
+    assert client.of("EXTENDED_SYS_STATE", since)[-1].landed_state == mav.MAV_LANDED_STATE_IN_AIR
 
 
 def test_silence_lands_and_tells_the_ground_station(connect) -> None:
