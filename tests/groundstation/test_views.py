@@ -1,0 +1,255 @@
+"""Rerun recordings: whole, verified, and drawn where there is a renderer."""
+
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from groundstation.compare import compare, waterfall
+from groundstation.reading import read_flight
+from groundstation.results import WhereItFails
+from groundstation.store import add_effect
+from groundstation.tracking import Tracking
+from groundstation.views import write_before_after, write_comparison, write_tracking, write_where
+from groundstation.views.colour import of_error
+from groundstation.views.comparison import rolling_rms
+from groundstation.views.monitor import Monitor, state
+from groundstation.where import where_it_fails
+from models.errors import InputError
+from models.model import linear_model, rigid_body_model
+from models.record_pb2 import Event, Tick
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+RERUN = Path(sys.executable).parent / "rerun"
+
+
+@pytest.fixture(scope="module")
+def flights():
+    drag = SAMPLES / "rotorpy" / "rotor_drag"
+    return read_flight(drag / "identify.parquet"), read_flight(drag / "validate.parquet")
+
+
+@pytest.fixture(scope="module")
+def versions(flights):
+    fitted, _ = flights
+    base = rigid_body_model(fitted.vehicle)
+    made = add_effect(base, "rotor_drag", [fitted])
+    return [linear_model(fitted.vehicle), replace(base, version=1), replace(made, version=2)]
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """A home of its own, with Rerun's analytics off."""
+    home = tmp_path_factory.mktemp("home")
+    own = {**os.environ, "HOME": str(home), "XDG_CONFIG_HOME": str(home), "XDG_DATA_HOME": str(home)}
+    subprocess.run([RERUN, "analytics", "disable"], env=own, check=True, capture_output=True)
+    return own
+
+
+def a_tracking(flight):
+    part = flight.part(slice(0, 1000))
+    expected = part.position_reference
+    miss = tuple(float(x) for x in np.mean((part.position - expected) ** 2, axis=0))
+    zeta = np.zeros((1000, 3))
+    return Tracking(
+        part, "lemniscate lqr", part.t, part.position, expected, expected, zeta, zeta, miss, (0.0, 0.0, 0.0)
+    )
+
+
+def write_all(folder, flights, versions):
+    fitted, held_out = flights
+    comparisons = [compare(fitted, model) for model in versions]
+    write_comparison(folder / "comparison.rrd", comparisons, where_it_fails(comparisons[0]))
+    write_where(folder / "where.rrd", comparisons[1], where_it_fails(comparisons[1]))
+    lines = [(model, fitted, held_out) for model in versions]
+    write_before_after(folder / "before_after.rrd", lines, waterfall(fitted, held_out, versions))
+    write_tracking(folder / "tracking.rrd", [a_tracking(fitted), a_tracking(held_out)])
+    with_monitor(folder / "monitor.rrd", fitted)
+
+
+def with_monitor(path, flight):
+    stream = rr.RecordingStream("trueflight monitor")
+    stream.save(path)
+    view = Monitor(stream, flight.vehicle.name)
+    view.add_ticks([a_tick(flight, k) for k in range(0, 2000, 5)])
+    view.add_event(
+        Event(vehicle_time_us=3_000_000, level="warning", kind="guard_trip", text="left the envelope")
+    )
+    view.update()
+    stream.flush()
+    stream.disconnect()
+
+
+def a_tick(flight, k):
+    tick = Tick(
+        vehicle_time_us=round(1e6 * flight.t[k]),
+        phase="mission",
+        flight_mode="OFFBOARD",
+        armed=True,
+        controller="corrected",
+        guard="active",
+        model="0123456789ab",
+        trajectory="lemniscate",
+        thrust_command=flight.thrust_command[k],
+        battery_voltage=flight.battery_voltage[k],
+        latency=0.0009,
+    )
+    for name in ("position", "velocity", "position_reference"):
+        vector = getattr(tick, name)
+        vector.x, vector.y, vector.z = getattr(flight, name)[k]
+    q = tick.quaternion
+    q.w, q.x, q.y, q.z = flight.quaternion[k]
+    return tick
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory, flights, versions):
+    folder = tmp_path_factory.mktemp("recordings")
+    write_all(folder, flights, versions)
+    return folder
+
+
+NAMES = ("comparison", "where", "before_after", "tracking", "monitor")
+
+
+def test_every_recording_is_whole_and_small(recordings, environment):
+    files = [recordings / f"{name}.rrd" for name in NAMES]
+    told = subprocess.run([RERUN, "rrd", "verify", *files], env=environment, capture_output=True, text=True)
+    assert told.returncode == 0, told.stderr
+    assert sorted(p.name for p in recordings.iterdir()) == sorted(f.name for f in files)
+    for file in files:
+        assert 10_000 < file.stat().st_size < 3_000_000
+
+
+def pixels(path):
+    """Rows of a PNG of 8 bits a channel, as (height, width, channels); filters undone."""
+    data = path.read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    place, body = 8, b""
+    while place < len(data):
+        size, kind = struct.unpack(">I4s", data[place : place + 8])
+        content = data[place + 8 : place + 8 + size]
+        if kind == b"IHDR":
+            width, height, depth, colour = struct.unpack(">IIBB", content[:10])
+            assert depth == 8 and colour in (2, 6)
+        elif kind == b"IDAT":
+            body += content
+        place += 12 + size
+    channels = 3 if colour == 2 else 4
+    raw = np.frombuffer(zlib.decompress(body), np.uint8).reshape(height, 1 + width * channels)
+    out = np.zeros((height, width, channels), np.uint8)
+    above = np.zeros((width, channels), np.int64)
+    for row in range(height):
+        line = raw[row, 1:].reshape(width, channels).astype(np.int64)
+        kind = int(raw[row, 0])
+        if kind == 2:
+            line = line + above
+        elif kind != 0:
+            left, corner = np.zeros(channels, np.int64), np.zeros(channels, np.int64)
+            for column in range(width):
+                up = above[column]
+                if kind == 1:
+                    guess = left
+                elif kind == 3:
+                    guess = (left + up) // 2
+                else:
+                    p = left + up - corner
+                    a, b, c = np.abs(p - left), np.abs(p - up), np.abs(p - corner)
+                    guess = np.where((a <= b) & (a <= c), left, np.where(b <= c, up, corner))
+                line[column] = (line[column] + guess) % 256
+                left, corner = line[column], up
+        above = line % 256
+        out[row] = above
+    return out
+
+
+def test_where_it_fails_is_drawn_in_the_colours_of_the_error(recordings, environment, tmp_path):
+    """The renderer draws the path: its picture holds colours of the error's scale that no part of the frame
+    has."""
+    picture = tmp_path / "where.png"
+    command = [
+        RERUN,
+        "--headless",
+        "--screenshot-to",
+        picture,
+        "--window-size",
+        "480x270",
+        recordings / "where.rrd",
+    ]
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    if not picture.exists():
+        pytest.skip(f"no renderer here: {told.stderr.strip().splitlines()[-1:]}")
+    seen = pixels(picture)[..., :3].reshape(-1, 3).astype(int)
+    scale = of_error(np.linspace(0.0, 1.0, 64), 1.0).astype(int)
+    near = [np.any(np.abs(seen - colour).sum(axis=1) < 40) for colour in scale[::8]]
+    assert sum(near) >= 6
+
+
+def test_a_recording_that_cannot_be_written_is_told(flights, versions):
+    comparison = compare(flights[1], versions[1], horizons=False)
+    with pytest.raises(InputError, match=r"cannot write the recording.*choose another --rrd"):
+        write_where(Path("/proc/none/where.rrd"), comparison, where_it_fails(comparison))
+
+
+def test_a_recording_that_fails_halfway_leaves_nothing(tmp_path, flights, versions):
+    comparison = compare(flights[1], versions[1], horizons=False)
+    broken = replace(comparison, residual=comparison.residual[:10])
+    with pytest.raises(ValueError):
+        write_where(tmp_path / "where.rrd", broken, WhereItFails((), (), ()))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_flight_without_position_or_attitude_has_views_too(tmp_path, environment):
+    flight = read_flight(SAMPLES / "crazyflie" / "ddsysid_crazyflie_log10_500Hz.parquet")
+    comparison = compare(flight, linear_model(flight.vehicle))
+    where = where_it_fails(comparison)
+    write_comparison(tmp_path / "comparison.rrd", [comparison], where)
+    write_where(tmp_path / "where.rrd", comparison, where)
+    for name in ("comparison", "where"):
+        subprocess.run(
+            [RERUN, "rrd", "verify", tmp_path / f"{name}.rrd"],
+            env=environment,
+            check=True,
+            capture_output=True,
+        )
+
+
+def test_rolling_rms_is_that_of_its_window_and_says_nothing_where_little_counts():
+    residual = np.full((500, 3), 2.0)
+    used = np.ones(500, bool)
+    np.testing.assert_allclose(rolling_rms(residual, used, 50), 2.0)
+    used[200:300] = False
+    rolled = rolling_rms(residual, used, 50)
+    assert np.all(np.isnan(rolled[230:270])) and np.all(np.isfinite(rolled[:200]))
+
+
+def test_colours_rise_in_lightness_with_the_error_and_missing_ones_are_grey():
+    colours = of_error(np.array([*np.linspace(0.0, 1.0, 50), np.nan]), 1.0).astype(float)
+    lightness = colours[:-1] @ [0.2126, 0.7152, 0.0722]
+    assert np.all(np.diff(lightness) > -0.5) and lightness[-1] > 3 * lightness[0]
+    assert len(set(colours[-1])) == 1
+
+
+def test_the_pilots_page_says_what_flies_and_when_the_vehicle_falls_silent(flights):
+    tick = a_tick(flights[0], 100)
+    page = state("quad5", tick, 0.0)
+    for word in (
+        "quad5: mission",
+        "**OFFBOARD**, armed",
+        "**corrected**",
+        "`0123456789ab`",
+        "active",
+        "0.9 ms",
+    ):
+        assert word in page
+    tick.guard = "tripped: outside the training range of vx"
+    assert "**tripped: outside the training range of vx**" in state("quad5", tick, 0.0)
+    assert "SILENT for 7 s" in state("quad5", tick, 7.2)
+    assert "No tick has arrived" in state("quad5", None, 0.0)
