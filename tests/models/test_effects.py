@@ -84,12 +84,17 @@ def near_ground(r: np.ndarray, v: np.ndarray, t: float, p: dict, z: float) -> np
 # effect -> the same physics written out for one sample: (R, v, specific thrust, parameters, height, volts)
 PLAIN: dict[str, Callable[..., np.ndarray]] = {
     "thrust_gain": lambda r, v, t, p, z, volts: np.array([0, 0, t * p["gain"]]),
-    "thrust_curve": lambda r, v, t, p, z, volts: np.array([0, 0, t + p["curvature"] * t * (t - GRAVITY) / GRAVITY]),
+    "thrust_curve": lambda r, v, t, p, z, volts: np.array(
+        [0, 0, t + p["curvature"] * t * (t - GRAVITY) / GRAVITY]
+    ),
     "battery_sag": lambda r, v, t, p, z, volts: np.array([0, 0, t * (volts / 16.0) ** p["exponent"]]),
     "ground_effect": lambda r, v, t, p, z, volts: near_ground(r, v, t, p, z),
     "rotor_drag": lambda r, v, t, p, z, volts: drag_linear(r, v, t, p),
     "parasitic_drag": lambda r, v, t, p, z, volts: drag_quadratic(r, v, t, p),
     "accelerometer_bias": lambda r, v, t, p, z, volts: np.array([p["x"], p["y"], t + p["z"]]),
+    "axial_inflow": lambda r, v, t, p, z, volts: np.array(
+        [0, 0, t - p["slope"] * (r.T @ v)[2] * math.sqrt(t / GRAVITY)]
+    ),
     "rigid_body": lambda r, v, t, p, z, volts: np.array([0, 0, t]),
 }
 
@@ -103,7 +108,12 @@ def test_effect_is_plain_vector_algebra(name, phi, theta, psi, vx, vy, vz, u, z,
     flight = sample(phi, theta, psi, (vx, vy, vz), u, z, volts)
     chain = () if name == "rigid_body" else ((name, values),)
     expected = PLAIN[name](
-        rotation(phi, theta, psi), np.array([vx, vy, vz]), GRAVITY * u / VEHICLE.hover_thrust, values, z, volts
+        rotation(phi, theta, psi),
+        np.array([vx, vy, vz]),
+        GRAVITY * u / VEHICLE.hover_thrust,
+        values,
+        z,
+        volts,
     )
     np.testing.assert_allclose(reading(flight, *chain), expected, atol=1e-6)
 
@@ -112,7 +122,9 @@ def test_effect_is_plain_vector_algebra(name, phi, theta, psi, vx, vy, vz, u, z,
 @given(angle, angle, yaw, speed, speed, command, speed, speed)
 def test_wind_is_velocity_taken_from_the_vehicle(phi, theta, psi, vx, vy, u, wx, wy) -> None:
     drag = ("rotor_drag", {"x": 0.2, "y": 0.3})
-    in_wind = reading(sample(phi, theta, psi, (vx, vy, 0.0), u, 1.0, 16.0), ("wind", {"x": wx, "y": wy}), drag)
+    in_wind = reading(
+        sample(phi, theta, psi, (vx, vy, 0.0), u, 1.0, 16.0), ("wind", {"x": wx, "y": wy}), drag
+    )
     in_still_air = reading(sample(phi, theta, psi, (vx - wx, vy - wy, 0.0), u, 1.0, 16.0), drag)
     np.testing.assert_allclose(in_wind, in_still_air, atol=1e-9)
 
@@ -122,7 +134,10 @@ def test_wind_is_velocity_taken_from_the_vehicle(phi, theta, psi, vx, vy, u, wx,
 def test_drag_never_feeds_energy(phi, theta, psi, vx, vy, vz) -> None:
     flight = sample(phi, theta, psi, (vx, vy, vz), 0.4, 1.0, 16.0)
     still = reading(flight)
-    for name, values in (("rotor_drag", {"x": 0.2, "y": 0.3}), ("parasitic_drag", {"x": 0.1, "y": 0.2, "z": 0.3})):
+    for name, values in (
+        ("rotor_drag", {"x": 0.2, "y": 0.3}),
+        ("parasitic_drag", {"x": 0.1, "y": 0.2, "z": 0.3}),
+    ):
         force = rotation(phi, theta, psi) @ (reading(flight, (name, values)) - still)
         assert force @ np.array([vx, vy, vz]) <= 1e-9
 
