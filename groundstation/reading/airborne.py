@@ -10,6 +10,7 @@ and what follows a crash.
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from groundstation.reading.uniform import segments
 from models.vehicle import Vehicle
@@ -39,7 +40,7 @@ def flying_mask(t: np.ndarray, columns: dict[str, np.ndarray], vehicle: Vehicle)
             last = _landing(t, columns, a, b) if b < part.stop else b
             if last > first and t[last - 1] - t[first] >= SHORTEST_RUN:
                 flying[first:last] = True
-    return flying & ~_impacts(t, columns, flying)
+    return flying & ~_impacts(t, columns, flying, vehicle)
 
 
 def _runs(on: np.ndarray, t: np.ndarray, dip: float) -> list[tuple[int, int]]:
@@ -75,17 +76,22 @@ def _landing(t: np.ndarray, columns: dict[str, np.ndarray], a: int, b: int) -> i
     return int(np.searchsorted(t, t[b - 1 - int(np.argmax(usual[::-1]))] - SETTLE))
 
 
-def _impacts(t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndarray) -> np.ndarray:
+def _impacts(
+    t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndarray, vehicle: Vehicle
+) -> np.ndarray:
     """Samples around an impact; after a crash, when flight ends soon, also all that follows in that run."""
     hit = np.zeros(len(t), dtype=bool)
     f = columns.get("specific_force")
     if f is None or not np.any(flying):
         return hit
     norm = np.linalg.norm(f, axis=1)
-    limit = max(CRASH, CRASH_RATIO * float(np.median(norm[flying])))
+    # What was commanded explains as much force: a racing quadrotor pulls 6 g without hitting anything.
+    width = max(1, round(0.3 / float(np.median(np.diff(t)))))
+    commanded = ndimage.maximum_filter1d(vehicle.thrust(columns["thrust_command"]) / vehicle.mass, width)
+    limit = np.maximum(max(CRASH, CRASH_RATIO * float(np.median(norm[flying]))), 3.0 * commanded)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flying.astype(np.int8), [0]])))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
-        over = a + np.flatnonzero(norm[a:b] > limit)
+        over = a + np.flatnonzero(norm[a:b] > limit[a:b])
         # One sample is a spike of the sensor; an impact rings.
         if over.size < 2:
             continue
