@@ -305,9 +305,9 @@ def track_command(
     as_json: JsonOption = False,
 ) -> None:
     """Flights against the linear behaviour expected of them: mean squared error per axis, as in the paper."""
-    from groundstation.tracking import track_file
+    from groundstation.tracking import told_apart, track_file
 
-    tracked = [track_file(path, design, vehicle) for path in flights]
+    tracked = told_apart([track_file(path, design, vehicle) for path in flights])
     if rrd is not None:
         from groundstation.views import write_tracking
 

@@ -3,7 +3,8 @@ behaviour."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,15 @@ def track_file(path: Path, design: Path | None = None, vehicle: Path | None = No
             f"{path}: the flight carries no design; pass --design FILE (`groundstation design` makes one)"
         )
     return track(flight, load_design(design, flight.vehicle), label)
+
+
+def told_apart(tracked: Sequence[Tracking]) -> list[Tracking]:
+    """The same flights, numbered in their labels where those would be equal."""
+    labels = [t.label for t in tracked]
+    return [
+        replace(t, label=f"{t.label} ({number + 1})") if labels.count(t.label) > 1 else t
+        for number, t in enumerate(tracked)
+    ]
 
 
 def track(flight: Flight, design: Design, label: str = "") -> Tracking:

@@ -57,7 +57,7 @@ def _blueprint(
             rrb.TimeSeriesView(
                 origin=f"acceleration/{name}",
                 name=f"{name} ({AXES[axis]}) acceleration, m/s², below {comparisons[0].bandwidth:g} Hz",
-                axis_x=rrb.TimeAxis(view_range=between(start, start + WINDOW)),
+                axis_x=rrb.TimeAxis(view_range=between(start, min(start + WINDOW, float(flight.t[-1])))),
                 axis_y=rrb.ScalarAxis(range=_range(values, flight.t, start)),
                 plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=axis == shown[0]),
             )

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.tracking import Tracking
+from groundstation.tracking import Tracking, told_apart
 from groundstation.views import scene
 from groundstation.views.bars import bar_groups
 from groundstation.views.colour import EXPECTED, NEWEST, Colour, of_version
@@ -18,6 +18,7 @@ from groundstation.views.recording import TIME, curve, recording, text
 
 def write_tracking(path: Path, tracked: Sequence[Tracking]) -> None:
     """Write the recording of flights (before first, after last) against their expected linear behaviour."""
+    tracked = told_apart(tracked)
     with recording(path, "tracking", " and ".join(t.label for t in tracked)) as stream:
         stream.send_blueprint(_blueprint(stream, tracked))
 
