@@ -37,6 +37,8 @@ MATERIAL_SHARE = 0.01
 """Smallest part of the remaining squared error that an effect must take away on held-out blocks."""
 MATERIAL_ACCELERATION = 0.02
 """m/s² RMS; smaller effects are within the bias stability of a MEMS accelerometer (2 mg)."""
+SURE_TO_SEE = 0.8
+"""Power below which a flight is said not to have excited an effect."""
 SCREENED = 3
 """Acceptable candidates fitted in full at each step, the most promising first."""
 STRONG_EVIDENCE = 6.0
@@ -205,7 +207,7 @@ class _Search:
                 break
             candidate = self.state((*current.added, *step))
             if not self._acceptable(candidate, current, step) or not all(
-                self._shows(current, n) for n in step
+                self._shows(candidate, n) for n in step
             ):
                 continue
             accepted += 1
@@ -254,20 +256,26 @@ class _Search:
         if through is not None:
             values[through] = {p.name: p.typical for p in self.known[through].parameters}
         rest = [(self.known[n], v) for n, v in values.items() if n != name]
-        neutral = values.get(name, effect.neutral(self.problem.vehicle))
+        neutral = effect.neutral(self.problem.vehicle)
         base = self.problem.predict([*rest, (effect, neutral)])
         moved = ({**neutral, p.name: p.typical} for p in effect.parameters)
         return np.column_stack([(self.problem.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
 
-    def _shows(self, current: _State, name: str) -> bool:
-        """Whether the effect at its typical size would matter beyond the simpler effects it coincides with."""
+    def _shows(self, candidate: _State, name: str) -> bool:
+        """Whether the effect at its typical size would be seen beyond the simpler effects it coincides with."""
         beyond = [n for n in self.known[name].beyond if n in self.candidates or n in self.base.names()]
         if not beyond:
             return True
-        mine = self._contribution(current, name).sum(axis=1)
-        simpler = np.column_stack([self._contribution(current, n) for n in beyond])
+        mine = self._contribution(candidate, name).sum(axis=1)
+        simpler = np.column_stack([self._contribution(candidate, n) for n in beyond])
         rest = mine - simpler @ np.linalg.lstsq(simpler, mine, rcond=None)[0]
-        return bool(np.sqrt(np.sum(rest**2) / len(self.problem.measured())) > MATERIAL_ACCELERATION)
+        return self._power(candidate, float(np.sum(rest**2)), len(self.known[name].parameters)) > SURE_TO_SEE
+
+    def _power(self, current: _State, energy: float, count: int) -> float:
+        """Probability that `count` parameters are significant when what they change has this squared sum."""
+        threshold = stats.chi2.isf(SIGNIFICANCE, count) * (current.fit.critical / 1.96) ** 2
+        unit = long_run_variance(self.problem, current.fit.residual)
+        return float(stats.ncx2.sf(threshold, count, energy / unit))
 
     def _evident(self, with_: _State, without: _State) -> bool:
         """Whether the evidence for `with_` pays for its further parameters (two each, as Akaike's criterion)."""
@@ -488,12 +496,8 @@ class _Search:
             mine = mine - fitted @ np.linalg.lstsq(fitted, mine, rcond=None)[0]
         energy = float(np.sum(mine**2))
         material = np.sqrt(energy / len(self.problem.measured())) > MATERIAL_ACCELERATION
-        count = len(self.known[name].parameters)
-        threshold = stats.chi2.isf(SIGNIFICANCE, count) * (current.fit.critical / 1.96) ** 2
-        power = stats.ncx2.sf(
-            threshold, count, energy / long_run_variance(self.problem, current.fit.residual)
-        )
-        return bool(material and power > 0.8 and energy > MATERIAL_SHARE * current.fit.sse)
+        power = self._power(current, energy, len(self.known[name].parameters))
+        return bool(material and power > SURE_TO_SEE and energy > MATERIAL_SHARE * current.fit.sse)
 
     def _judge_unmeasured(self, effect: Effect) -> EffectVerdict:
         """The verdict on an effect whose measurements the flight lacks."""

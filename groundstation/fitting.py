@@ -133,7 +133,7 @@ class Fit:
 
     def interval(self, index: int) -> tuple[float, float]:
         """95 % interval of one free number."""
-        half = self.critical * float(np.sqrt(max(self.covariance[index, index], 0.0)))
+        half = half_width(self.free[index], self.covariance[index, index], self.critical)
         return float(self.estimate[index] - half), float(self.estimate[index] + half)
 
     def wald(self, effect: str) -> float:
@@ -156,6 +156,11 @@ class Fit:
         return float(
             np.clip(self.estimate[index], free.neutral - free.tolerance, free.neutral + free.tolerance)
         )
+
+
+def half_width(free: Free, variance: float, critical: float) -> float:
+    """Half of a 95 % interval. No log tells the clock better than its period, however well a fit is conditioned."""
+    return critical * float(np.sqrt(max(variance, 0.0))) + free.tolerance
 
 
 def critical_value(duration: float) -> float:
@@ -246,7 +251,7 @@ def fit(
     values = {name: dict(fixed.get(name, {})) for name in chain_names}
     intervals: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in chain_names}
     for i, f in enumerate(free):
-        half = critical * float(np.sqrt(max(covariance[i, i], 0.0)))
+        half = half_width(f, covariance[i, i], critical)
         values[f.effect][f.parameter.name] = float(estimate[i])
         intervals[f.effect][f.parameter.name] = (float(estimate[i] - half), float(estimate[i] + half))
     fitted = tuple(

@@ -345,7 +345,7 @@ def _low_pass(
     "excitation",
     "a survey of about 45 s that shows every effect: heights down to `low`, fast and slow along both axes, "
     "at two yaws, and hard vertical moves",
-    Parameter("low", 0.2, 0.08, 5.0, "m", "lowest height above ground"),
+    Parameter("low", 0.3, 0.08, 5.0, "m", "lowest height above ground"),
     Parameter("size", 2.2, 0.5, 20.0, "m", "half the length of the passes"),
     Parameter("speed", 4.0, 0.5, 12.0, "m/s", "greatest reference speed"),
     Parameter("height", 1.3, 0.5, 30.0, "m", "height of the fast passes"),
