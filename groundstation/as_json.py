@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from groundstation.diagnosis import Diagnosis
-from groundstation.results import Comparison, WaterfallStep, WhereItFails
+from groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
 from models.model import Model
 
 UNIT = "m/s^2"

@@ -22,10 +22,10 @@ from rich.console import Console
 from rich.table import Table
 
 from groundstation.compare import compare, waterfall
-from groundstation.diagnosis import Diagnosis, diagnose
+from groundstation.diagnosis import diagnose
 from groundstation.link import Link
 from groundstation.reading import read_flight
-from groundstation.results import Comparison
+from groundstation.results import Comparison, Diagnosis
 from groundstation.settings import Settings
 from groundstation.store import add_effect, lineage, save
 from groundstation.tables import (

@@ -25,7 +25,8 @@ from groundstation.fitting import (
     with_clock,
 )
 from groundstation.measurement import Measurement, measure
-from groundstation.remainder import Unexplained, unexplained
+from groundstation.remainder import unexplained
+from groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
 from models.effect import Effect
 from models.effects import catalogue, effect_named
 from models.flight import Flight
@@ -44,60 +45,6 @@ SCREENED = 3
 STRONG_EVIDENCE = 6.0
 """Twice the log likelihood ratio from which one explanation is told from another (Kass & Raftery 1995)."""
 MOST_EFFECTS = 6
-
-
-@dataclass(frozen=True)
-class ParameterEstimate:
-    """A parameter with its 95 % interval."""
-
-    name: str
-    value: float
-    low: float
-    high: float
-    unit: str
-
-
-@dataclass(frozen=True)
-class EffectVerdict:
-    """What the flight says about one effect of the catalogue.
-
-    `verdict` is one of missing, possible, not_supported, not_excited, included. `variance_share` is the part
-    of the squared error before that the effect takes away, given the others; `p_value` robust to
-    autocorrelation.
-    """
-
-    name: str
-    verdict: str
-    rank: int | None
-    variance_share: float
-    p_value: float
-    parameters: tuple[ParameterEstimate, ...]
-    indistinguishable_from: tuple[str, ...]
-    advice: str
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """The result of `diagnose`. RMS figures in m/s² over all axes, behind the stated bandwidth in Hz."""
-
-    flight: Flight
-    base: Model
-    model: Model
-    rms_before: float
-    rms_after: float
-    noise_floor: float
-    bandwidth: float
-    axes: tuple[int, ...]
-    validation_before: float | None
-    validation_after: float | None
-    clock_shift: float | None
-    effects: tuple[EffectVerdict, ...]
-    unexplained: Unexplained
-    left_out: dict[str, float]
-
-    def named(self, verdict: str) -> tuple[str, ...]:
-        """Names of the effects with this verdict, in order of rank."""
-        return tuple(e.name for e in self.effects if e.verdict == verdict)
 
 
 @dataclass(frozen=True)

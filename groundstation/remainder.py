@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from groundstation.fitting import BLOCK
 from groundstation.measurement import Measurement
+from groundstation.results import Unexplained
 from models.frames import euler_from_quaternion, rotate_inverse
 
 SHARE = 0.10
 """Part of the remaining squared error that must be predictable on held-out blocks to be called structure."""
 MATERIAL = 0.03
 """m/s² RMS of that part."""
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """Whether predictable structure is left, its share of the remaining squared error, and what it goes
-    with."""
-
-    verdict: bool
-    variance_share: float
-    where: tuple[str, ...]
 
 
 def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.flight import Flight
+from models.model import Model
 
 
 @dataclass(frozen=True)
@@ -115,3 +116,67 @@ class WaterfallStep:
     fitted: float
     held_out: float | None
     noise_floor: float
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Whether predictable structure is left, its share of the remaining squared error, and what it goes
+    with."""
+
+    verdict: bool
+    variance_share: float
+    where: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """A parameter with its 95 % interval."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class EffectVerdict:
+    """What the flight says about one effect of the catalogue.
+
+    `verdict` is one of missing, possible, not_supported, not_excited, included. `variance_share` is the part
+    of the squared error before that the effect takes away, given the others; `p_value` robust to
+    autocorrelation.
+    """
+
+    name: str
+    verdict: str
+    rank: int | None
+    variance_share: float
+    p_value: float
+    parameters: tuple[ParameterEstimate, ...]
+    indistinguishable_from: tuple[str, ...]
+    advice: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The result of `diagnose`. RMS figures in m/s² over all axes, behind the stated bandwidth in Hz."""
+
+    flight: Flight
+    base: Model
+    model: Model
+    rms_before: float
+    rms_after: float
+    noise_floor: float
+    bandwidth: float
+    axes: tuple[int, ...]
+    validation_before: float | None
+    validation_after: float | None
+    clock_shift: float | None
+    effects: tuple[EffectVerdict, ...]
+    unexplained: Unexplained
+    left_out: dict[str, float]
+
+    def named(self, verdict: str) -> tuple[str, ...]:
+        """Names of the effects with this verdict, in order of rank."""
+        return tuple(e.name for e in self.effects if e.verdict == verdict)

@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from groundstation.diagnosis import Diagnosis, EffectVerdict
-from groundstation.results import Comparison, WaterfallStep, WhereItFails
+from groundstation.results import Comparison, Diagnosis, EffectVerdict, WaterfallStep, WhereItFails
 
 VERDICT_STYLE = {
     "missing": "bold red",

@@ -20,7 +20,7 @@ MOMENT = 1.0
 def where_it_fails(comparison: Comparison) -> WhereItFails:
     """Maps, regions and worst moments of the squared residual over the used samples of `comparison`."""
     flight, used = comparison.flight, comparison.used
-    error = np.nansum(comparison.residual**2, axis=1)
+    error = np.nanmean(comparison.residual**2, axis=1)  # over the axes that are measured
     variables = _variables(flight)
     maps = tuple(_map(name, unit, x[used], error[used]) for name, unit, x, _ in variables)
     regions = [
@@ -44,13 +44,13 @@ def _variables(flight: Flight) -> list[Variable]:
         speed = np.linalg.norm(flight.velocity[:, :2], axis=1)
         out.append(("horizontal speed", "m/s", speed, ("slower than", "faster than")))
         out.append(
-            ("climb speed", "m/s", flight.velocity[:, 2], ("sinking or climbing below", "climbing above"))
+            ("climb speed", "m/s", flight.velocity[:, 2], ("at climb speeds below", "at climb speeds above"))
         )
     if flight.quaternion is not None:
         up = np.clip(rotation_matrix(flight.quaternion)[:, 2, 2], -1.0, 1.0)
         out.append(("tilt", "deg", np.degrees(np.arccos(up)), ("at tilts below", "at tilts above")))
     thrust = flight.column("thrust_command") / flight.vehicle.hover_thrust
-    out.append(("thrust over hover thrust", "1", thrust, ("at thrust below", "at thrust above")))
+    out.append(("thrust", "hover", thrust, ("at thrust below", "at thrust above")))
     if flight.battery_voltage is not None:
         out.append(("battery voltage", "V", flight.battery_voltage, ("below", "above")))
     out.append(("time", "s", flight.t - flight.t[0], ("before", "after")))
@@ -95,7 +95,8 @@ def _region(name: str, unit: str, x: np.ndarray, error: np.ndarray, words: tuple
 
 
 def _number(value: float, unit: str) -> str:
-    return f"{value:.2g} {unit}".strip() if unit != "1" else f"{value:.2g} of hover"
+    """A value with its unit; thrust in multiples of the hover's."""
+    return f"{value:.2f} times hover" if unit == "hover" else f"{value:.3g} {unit}".strip()
 
 
 def _worst(
@@ -119,7 +120,7 @@ def _worst(
             if name != "time"
         )
         start, end = float(flight.t[k]), float(flight.t[min(k + width, len(flight) - 1)])
-        moments.append(Moment(start, end, float(np.sqrt(score[k] / len(comparison.axes))), told))
+        moments.append(Moment(start, end, float(np.sqrt(score[k])), told))
         score[max(0, k - width) : k + width] = -1.0
     return tuple(moments)
 

@@ -40,7 +40,9 @@ def test_a_package_imports_only_what_its_role_allows(package: str) -> None:
     for path in sorted((ROOT / package).rglob("*.py")):
         if path.name == "record_pb2.py":
             continue
-        allowed = EVERYWHERE | ALLOWED[package] | FITS_OR_EXPORTS.get(path.relative_to(ROOT).as_posix(), set())
+        allowed = (
+            EVERYWHERE | ALLOWED[package] | FITS_OR_EXPORTS.get(path.relative_to(ROOT).as_posix(), set())
+        )
         foreign = {name.split(".")[0] for name in imports(path)} - STANDARD - allowed
         assert not foreign, f"{path.relative_to(ROOT)} imports {sorted(foreign)}"
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.diagnosis import Diagnosis, diagnose
+from groundstation.diagnosis import diagnose
 from groundstation.reading import read_flight
+from groundstation.results import Diagnosis
 from models.model import Term, rigid_body_model
 
 ROOT = Path(__file__).parents[2]
