@@ -333,7 +333,7 @@ def _summary(console: Console, o: Outcome) -> None:
     d = o.diagnosis
 
     def row(what: str, unit: str, before: float, after: float) -> None:
-        ratio = f"÷ {before / after:.1f}" if after > 0 else ""
+        ratio = f"÷ {before / after:.1f}" if before >= after else f"× {after / before:.1f}"
         table.add_row(what, unit, f"{before:.3g}", f"{after:.3g}", ratio)
 
     row("model, fitted flight (residual RMS)", "m/s²", d.rms_before, d.rms_after)
@@ -375,24 +375,24 @@ def real_flights(console: Console) -> list[tuple[Flight, Diagnosis]]:
     folder = Path(__file__).parent.parent / "samples" / "crazyflie"
     _step(console, "Real flights of Crazyflies", "groundstation diagnose samples/crazyflie/...")
     table = Table()
-    for column in ("flight", "known of it", "found", "residual m/s²"):
-        table.add_column(column)
+    for column in ("flight, and what is known", "found", "share", "parameters, 95 % interval"):
+        table.add_column(column, no_wrap=column == "found", justify="right" if column == "share" else "left")
     results = []
     for file, known in REAL:
         with console.status(f"diagnosing {file}"):
             flight = read_flight(folder / file)
             result = diagnose(flight, rigid_body_model(flight.vehicle))
         results.append((flight, result))
-        found = []
-        for e in result.effects:
-            if e.verdict in ("missing", "possible") and e.rank:
-                values = ", ".join(
-                    f"{p.name} {p.value:.3g} [{p.low:.3g}, {p.high:.3g}]" for p in e.parameters
-                )
-                told = "" if e.verdict == "missing" else f" ({SAID['possible']})"
-                found.append(f"{e.name}{told}: {values}; {percent(e.variance_share)} of the error")
-        table.add_row(
-            file, known, "\n".join(found) or "nothing", f"{result.rms_before:.3f} -> {result.rms_after:.3f}"
-        )
+        name = f"{flight.name}: {known}\nresidual {result.rms_before:.2f} -> {result.rms_after:.3f} m/s²"
+        for e in (e for e in result.effects if e.rank):
+            values = "\n".join(
+                f"{p.name} = {p.value:.3g} [{p.low:.3g}, {p.high:.3g}] {p.unit}" for p in e.parameters
+            )
+            effect = e.name if e.verdict == "missing" else f"{e.name} ({SAID[e.verdict]})"
+            table.add_row(
+                name, effect, percent(e.variance_share), values.replace(" 1\n", "\n").removesuffix(" 1")
+            )
+            name = ""
+        table.add_section()
     console.print(table)
     return results
