@@ -78,7 +78,8 @@ def _region(name: str, unit: str, x: np.ndarray, error: np.ndarray, words: tuple
     e = np.r_[0.0, np.cumsum(np.bincount(number, weights=error, minlength=len(edges) - 1))] / error.sum()
     s = np.r_[0.0, np.cumsum(np.bincount(number, minlength=len(edges) - 1))] / len(x)
     excess = (e[None, :] - e[:, None]) - (s[None, :] - s[:, None])
-    excess[(s[None, :] - s[:, None]) > 0.6] = -1.0
+    backwards = np.tri(len(s), dtype=bool)  # an interval ends after it begins; its complement scores the same
+    excess[backwards | ((s[None, :] - s[:, None]) > 0.6)] = -1.0
     i, j = np.unravel_index(int(np.argmax(excess)), excess.shape)
     share_error, share_time = float(e[j] - e[i]), float(s[j] - s[i])
     if share_error < 0.3 or share_error < 1.5 * share_time:
