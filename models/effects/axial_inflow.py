@@ -13,7 +13,7 @@ def formula(motion: Motion, *, slope: Array) -> Motion:
     """
     xp = array_namespace(motion.thrust)
     _, _, up = motion.body_velocity
-    rotor_speed = xp.sqrt(xp.clip(motion.command, 0.0, None) / GRAVITY)
+    rotor_speed = xp.sqrt(xp.clip(motion.thrust, 0.0, None) / GRAVITY)
     force = xp.stack([0.0 * up, 0.0 * up, -slope * up * rotor_speed], axis=-1)
     return motion.with_(force=motion.force + force)
 

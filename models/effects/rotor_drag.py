@@ -13,7 +13,7 @@ def formula(motion: Motion, *, x: Array, y: Array) -> Motion:
     """
     xp = array_namespace(motion.thrust)
     ahead, left, _ = motion.body_velocity
-    rotor_speed = xp.sqrt(xp.clip(motion.command, 0.0, None) / GRAVITY)
+    rotor_speed = xp.sqrt(xp.clip(motion.thrust, 0.0, None) / GRAVITY)
     force = xp.stack([-x * ahead * rotor_speed, -y * left * rotor_speed, 0.0 * ahead], axis=-1)
     return motion.with_(force=motion.force + force)
 
