@@ -160,7 +160,7 @@ def test_a_correction_outside_its_training_trips_and_the_flight_goes_on(companio
     flown = ticks["phase"] == "mission"
     assert ticks["guard"][flown][-1].startswith("tripped: z outside its training range")
     assert np.all(ticks["correction"][flown] == 0.0)
-    assert contract.model_hash(onnx) in companion.told("guard_trip")[-1]
+    assert contract.model_hash(onnx) in wait_for(lambda: companion.told("guard_trip"), "the event")[-1]
     assert companion.ask("model", {"command": "rollback"})["accepted"]
 
 
@@ -187,7 +187,7 @@ def test_what_cannot_be_flown_is_refused_with_the_reason(companion: Companion) -
     )
     assert not answer["accepted"]
     assert "made for vehicle 'other'" in answer["reason"]
-    assert any("other" in text for text in companion.told("model_refused"))
+    assert "other" in wait_for(lambda: companion.told("model_refused"), "the event")[-1]
 
 
 def test_an_order_to_land_ends_a_flight_early_and_empties_the_queue(companion: Companion) -> None:
@@ -223,7 +223,7 @@ def test_the_pilot_takes_over_and_keeps_it(bridge: tuple[Bridge, int], companion
     companion.phase("mission")
     bridge[0].pilot("POSCTL")
     companion.phase("silent")
-    assert "POSCTL" in companion.told("pilot_takeover")[-1]
+    assert "POSCTL" in wait_for(lambda: companion.told("pilot_takeover"), "the event")[-1]
     count = len(companion.ticks)
     wait_for(lambda: len(companion.ticks) > count + 200, "two more seconds of ticks")
     assert not any(tick.setpoint_sent for tick in companion.ticks[count:])
