@@ -37,7 +37,6 @@ class Model:
     parent: int | None = None
     data_hash: str = ""
     created: str = ""
-    note: str = ""
     fit: Mapping[str, float] = field(default_factory=dict)
     effects_directory: str | None = None
 

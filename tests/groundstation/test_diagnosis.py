@@ -87,7 +87,7 @@ def test_flights_of_another_simulator(case: str, missing: tuple[str, ...]) -> No
     ("file", "gain"), [("crazyswarm2_log08.csv", 1.44), ("crazyswarm2_log201.csv", 0.0369 / 0.0406)]
 )
 def test_real_crazyflies_thrust_gain_and_drag(file: str, gain: float) -> None:
-    # gains: the least-squares study of the same flights that samples/README.md tells of
+    # gains of a plain least-squares study of these flights; the payload one is the ratio of the two weights
     result = diagnosis_of(SAMPLES / "crazyflie" / file)
     assert result.named("missing")[:2] == ("thrust_gain", "rotor_drag")
     found = next(e for e in result.effects if e.name == "thrust_gain")
