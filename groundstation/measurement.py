@@ -143,7 +143,11 @@ def _used(flight: Flight, bandwidth: float) -> tuple[np.ndarray, dict[str, float
     used &= ~out
     if flight.has("angular_velocity", "body_rate_command"):
         error = np.abs(flight.body_rate_command - flight.angular_velocity).max(axis=1)  # type: ignore[operator]
-        out = ndimage.binary_dilation(error > RATE_ERROR_LIMIT, iterations=settling)
+        # a vehicle whose rates never follow closely keeps its calmer half
+        for limit in (RATE_ERROR_LIMIT, 2.0 * RATE_ERROR_LIMIT, 4.0 * RATE_ERROR_LIMIT, np.inf):
+            out = ndimage.binary_dilation(error > limit, iterations=settling)
+            if (used & ~out).sum() >= 0.5 * used.sum():
+                break
         left_out["turning harder than commanded rates follow"] = float((out & used).mean())
         used &= ~out
     edge = max(2, int(0.5 / bandwidth / flight.dt))
