@@ -33,13 +33,19 @@ VehicleFile = Annotated[
 ]
 Config = Annotated[Path | None, typer.Option(help="Configuration (sim-bridge.toml); flags override it.")]
 HiddenNames = Annotated[
-    list[str] | None, typer.Option(help="Effect to hide: NAME, NAME:SIZE, random, none. Repeatable.")
+    list[str] | None, typer.Option(help="Effect to hide: NAME, NAME:SIZE, rich, random, none. Repeatable.")
 ]
 HiddenCount = Annotated[int | None, typer.Option(help="How many effects `random` draws.")]
 Seed = Annotated[int | None, typer.Option(help="Of the draw and of the noise.")]
-Sealed = Annotated[Path | None, typer.Option(help="Where the answer to `random` goes, for `reveal`.")]
+Sealed = Annotated[
+    Path | None, typer.Option(help="Where the answer to `random` or `rich` goes, for `reveal`.")
+]
 NoiseScale = Annotated[
     float | None, typer.Option(help="Scale of sensor noise and estimator errors; 0: none.")
+]
+Charge = Annotated[float | None, typer.Option(help="The battery's state of charge at the start, 0 to 1.")]
+BatteryAge = Annotated[
+    float | None, typer.Option(help="Factor on the battery's internal resistance: 1 new, 2 worn out.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
@@ -54,7 +60,7 @@ def _seal(settings: Settings, hidden: tuple[Hidden, ...], vehicle: Vehicle, defa
     """
     from sim_bridge.seal import seal
 
-    if not settings.sealed and "random" not in settings.hidden:
+    if not settings.sealed and not {"random", "rich"} & set(settings.hidden):
         return None
     path = Path(settings.sealed) if settings.sealed else default
     seal(hidden, vehicle.name, settings.seed, path)
@@ -77,6 +83,8 @@ def run(
     seed: Seed = None,
     sealed: Sealed = None,
     noise: NoiseScale = None,
+    charge: Charge = None,
+    battery_age: BatteryAge = None,
     mavlink: Annotated[str | None, typer.Option(help="The companion's address: udpout:HOST:PORT.")] = None,
     port: Annotated[int | None, typer.Option(help="The vehicle's own UDP port on 127.0.0.1.")] = None,
     pilot_port: Annotated[int | None, typer.Option(help="UDP port of the simulated pilot; 0: none.")] = None,
@@ -100,6 +108,7 @@ def run(
     names = ("vehicle", "hidden", "hidden_count", "seed", "sealed", "noise", "mavlink", "port", "pilot_port")
     flags = {name: value for name, value in locals().items() if name in names}
     flags |= {"speed": speed, "duration": duration, "pilot_mode": pilot_mode}
+    flags |= {"charge": charge, "battery_age": battery_age}
     settings = load_settings(config, flags | {"pilot_takes_over_at": pilot_takes_over_at})
     believed = load_vehicle(settings.vehicle)
     from sim_bridge.autopilot import Autopilot
@@ -117,7 +126,8 @@ def run(
         parameters.set_text(assignment)
     link = Link(("127.0.0.1", settings.port), settings.remote, settings.pilot_port)
     effects = choose(list(settings.hidden), believed, settings.seed, settings.hidden_count)
-    autopilot = Autopilot(Simulator(believed, effects, settings.seed, settings.sensor_noise), parameters)
+    simulator = Simulator(believed, effects, settings.seed, settings.sensor_noise, settings.battery)
+    autopilot = Autopilot(simulator, parameters)
     server = Server(autopilot, link, settings.speed)
     answer = _seal(settings, effects, believed, Path(f"hidden-seed-{settings.seed}.sealed"))
     stopped: list[int] = []
@@ -184,13 +194,25 @@ def fly(
     seed: Seed = None,
     sealed: Sealed = None,
     noise: NoiseScale = None,
+    charge: Charge = None,
+    battery_age: BatteryAge = None,
     table: Annotated[bool, typer.Option("--csv", help="Write a CSV beside the record, too.")] = False,
     as_json: Json = False,
 ) -> None:
     """Fly in-process, without MAVLink, by the companion's own control law, and write the same flight
     record.
     """
-    names = ("vehicle", "design", "hidden", "hidden_count", "seed", "sealed", "noise")
+    names = (
+        "vehicle",
+        "design",
+        "hidden",
+        "hidden_count",
+        "seed",
+        "sealed",
+        "noise",
+        "charge",
+        "battery_age",
+    )
     settings = load_settings(config, {name: value for name, value in locals().items() if name in names})
     believed = load_vehicle(settings.vehicle)
     from models.design import load_design
@@ -208,6 +230,7 @@ def fly(
         rate,
         None if model is None else _bytes(model),
         settings.sensor_noise,
+        settings.battery,
     )
     csv_file = output.with_suffix(".csv") if table else None
     with _Progress(plan.repeat * plan.trajectory.duration * rate, as_json) as progress:

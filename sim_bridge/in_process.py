@@ -24,6 +24,7 @@ from models.record_pb2 import Event, Tick
 from models.trajectory import ReferenceSample, Trajectory, transfer
 from models.vehicle import Vehicle
 from sim_bridge.simulator import Simulator
+from sim_bridge.truth.battery import FULL, BatteryState
 from sim_bridge.truth.hidden import Hidden
 from sim_bridge.truth.sensors import Estimate, Noise
 from sim_bridge.world import PHYSICS_STEP
@@ -51,6 +52,7 @@ class Plan:
     rate: float = 100.0
     model: bytes | None = None
     noise: Noise | None = None
+    battery: BatteryState = FULL
 
     @property
     def steps_per_tick(self) -> int:
@@ -101,13 +103,14 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     """Fly a plan from hover at the start of its trajectory; `on_sample` is called once a control tick.
 
     Positions are in the home frame: origin where the vehicle's centre of mass is when it stands on the
-    ground, z up, axes of the world. Raises `InputError` for a design or a model that belongs to another
+    ground, z up, axes of the world. The control law knows what has been reported, which may be old, and takes
+    the reference of the moment that it tells of. Raises `InputError` for a design or a model that belongs to another
     vehicle.
     """
     vehicle = plan.vehicle
     law = ControlLaw(vehicle, plan.design)
     guard, steps = _guard(plan), plan.steps_per_tick
-    simulator = Simulator(vehicle, plan.hidden, plan.seed, plan.noise)
+    simulator = Simulator(vehicle, plan.hidden, plan.seed, plan.noise, plan.battery)
     ground = simulator.world.standing_height
     x, y, z, yaw = plan.trajectory.start
     simulator.start_in_hover((x, y, z + ground), yaw)
@@ -116,11 +119,11 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     ticks, touching, outcome = 0, 0, "finished"
     if guard is not None:
         guard.start()
-    estimate, step = simulator.estimate, simulator.step
+    reported, step = simulator.reported, simulator.step
     status, inference = "off", 0.0
     begin = time.perf_counter()
     for reference in _references(plan, period):
-        now = estimate()
+        now = reported()
         px, py, pz = now.position
         position = (px, py, pz - ground)
         state = State(position, now.velocity, now.quaternion, position[2], now.battery_voltage)

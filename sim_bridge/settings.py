@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from models.errors import InputError
+from sim_bridge.truth.battery import BatteryState
 from sim_bridge.truth.sensors import NO_NOISE, Noise
 
 
@@ -23,6 +24,8 @@ class Settings:
     seed: int = 0
     sealed: str = ""
     noise: float = 1.0
+    charge: float = 0.97
+    battery_age: float = 1.0
     mavlink: str = "udpout:127.0.0.1:14540"
     port: int = 14580
     pilot_port: int = 14590
@@ -42,6 +45,11 @@ class Settings:
         return replace(NO_NOISE, **scaled)
 
     @property
+    def battery(self) -> BatteryState:
+        """State of the battery when a flight begins."""
+        return BatteryState(self.charge, self.battery_age)
+
+    @property
     def remote(self) -> tuple[str, int]:
         """Host and port of `mavlink`."""
         kind, _, address = self.mavlink.partition(":")
@@ -57,6 +65,8 @@ _LIMITS = {
     "hidden_count": (1, 20),
     "seed": (0, 2**63),
     "noise": (0.0, 100.0),
+    "charge": (0.05, 1.0),
+    "battery_age": (0.5, 4.0),
     "port": (1, 65535),
     "pilot_port": (0, 65535),
     "speed": (0.05, 50.0),

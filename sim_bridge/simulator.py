@@ -2,27 +2,44 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
 import mujoco
 
 from models.vehicle import Vehicle
 from sim_bridge.rates import RateController
 from sim_bridge.truth.airframe import believed_powertrain
-from sim_bridge.truth.hidden import Hidden, install
+from sim_bridge.truth.battery import FULL, BatteryState, in_state
+from sim_bridge.truth.hidden import Hidden, after_takeoff, install
 from sim_bridge.truth.sensors import Estimate, Noise, Sensors
 from sim_bridge.world import PHYSICS_STEP, World
 
 _STEP_US = round(PHYSICS_STEP * 1e6)
+_LEFT_GROUND = 0.05  # m above standing at which the time after take-off begins
+
+_Moment = tuple[
+    int, list[float], list[float], tuple[float, float, float], tuple[float, ...], float, Sequence[float]
+]
+"""The arguments of `Sensors.sample`."""
 
 
 class Simulator:
     """A vehicle that follows a normalised collective command and body rates (rad/s, FLU).
 
     The setpoint reaches the inner loop after the powertrain's delay; the inner loop, the rotors and the rigid
-    body advance by 2 ms a step. `time_us` is the vehicle's clock: simulated time.
+    body advance by 2 ms a step. `time_us` is the vehicle's clock: simulated time. `estimate` is what the vehicle
+    itself knows, `reported` what a companion has been told of it.
     """
 
     def __init__(
-        self, vehicle: Vehicle, hidden: tuple[Hidden, ...] = (), seed: int = 0, noise: Noise | None = None
+        self,
+        vehicle: Vehicle,
+        hidden: tuple[Hidden, ...] = (),
+        seed: int = 0,
+        noise: Noise | None = None,
+        battery: BatteryState = FULL,
     ) -> None:
         self.vehicle = vehicle
         self.world = World(vehicle)
@@ -34,9 +51,9 @@ class Simulator:
         )
         self._mj_step, self._model, self._data = mujoco.mj_step, self.world.model, self.world.data
         self.sensors = Sensors(Noise() if noise is None else noise, seed)
-        powertrain, self.airframe = install(
-            vehicle, hidden, believed_powertrain(vehicle), self.sensors, PHYSICS_STEP
-        )
+        believed = believed_powertrain(vehicle)
+        believed = replace(believed, battery=in_state(believed.battery, battery))
+        powertrain, self.airframe = install(vehicle, hidden, believed, self.sensors, PHYSICS_STEP)
         self.rates = RateController(vehicle, PHYSICS_STEP)
         self.time_us = 0
         self.motors = [0.0, 0.0, 0.0, 0.0]
@@ -47,6 +64,15 @@ class Simulator:
         self._whole = whole
         self._cursor = 0
         self._estimate: Estimate | None = None
+        self._reported: Estimate | None = None
+        # Samples on their way to the companion, oldest first; none are kept where it is told at once.
+        late = round(self.sensors.delay / PHYSICS_STEP)
+        self._underway: deque[_Moment] | None = deque(maxlen=late + 1) if late else None
+        if self._underway is not None:
+            self._underway.append(self._moment())
+        self._flying_steps = 0
+        self._events = after_takeoff(hidden, vehicle)
+        self._ahead = list(self._events)
 
     def start_in_hover(
         self,
@@ -62,7 +88,16 @@ class Simulator:
         self.airframe.spin(self.airframe.speed_of(hover))
         self.motors = [hover] * 4
         self._line = [(hover, 0.0, 0.0, 0.0)] * len(self._line)
-        self._estimate = None
+        # There is no step yet to take an acceleration from: none.
+        motion = self.airframe.motion
+        motion.vx, motion.vy, motion.vz = velocity
+        self._estimate = self._reported = None
+        if self._underway is not None:
+            # It has hovered there for a while: the first sample to arrive is of time zero.
+            size = self._underway.maxlen or 1
+            still = self._moment()[1:]
+            self.time_us = (size - 1) * _STEP_US
+            self._underway.extend((i * _STEP_US, *still) for i in range(size))
 
     def step(self, command: float, p: float, q: float, r: float) -> None:
         """One physics step with the rotors running under a collective command and body-rate setpoints."""
@@ -89,6 +124,10 @@ class Simulator:
         self._mj_step(self._model, self._data)
         self.time_us += _STEP_US
         self._estimate = None
+        if self._underway is not None:
+            self._underway.append(self._moment())
+        if self._ahead:
+            self._fly_on()
 
     def rest(self) -> None:
         """One physics step with the motors stopped (disarmed or killed)."""
@@ -101,21 +140,50 @@ class Simulator:
         world.step()
         self.time_us += _STEP_US
         self._estimate = None
+        if self._underway is not None:
+            self._underway.append(self._moment())
+        if self._flying_steps:
+            self._flying_steps = 0
+            self._ahead = list(self._events)
+            world.unload()
 
     def estimate(self) -> Estimate:
         """What the vehicle believes of itself now; the same sample until the next step."""
         if self._estimate is None:
-            world, m = self.world, self.airframe.motion
-            position, velocity = world.position.tolist(), world.velocity.tolist()
-            rotation = (m.r00, m.r01, m.r02, m.r10, m.r11, m.r12, m.r20, m.r21, m.r22)
-            # Before the first step there is none to take the acceleration from: the vehicle stands or hovers.
-            rate = 1.0 / PHYSICS_STEP if self.time_us else 0.0
-            acceleration = (
-                (velocity[0] - m.vx) * rate,
-                (velocity[1] - m.vy) * rate,
-                (velocity[2] - m.vz) * rate,
-            )
-            self._estimate = self.sensors.sample(
-                self.time_us, position, velocity, acceleration, rotation, m.voltage, m.speeds
-            )
+            self._estimate = self.sensors.sample(*self._moment())
         return self._estimate
+
+    def reported(self) -> Estimate:
+        """What a companion has been told last: the estimate as old as the sensors' delay, with its own time."""
+        if self._underway is None:
+            return self.estimate()
+        moment = self._underway[0]
+        if self._reported is None or self._reported.time_us != moment[0]:
+            self._reported = self.sensors.sample(*moment)
+        return self._reported
+
+    def _moment(self) -> _Moment:
+        """The truth now, as `Sensors.sample` takes it."""
+        m = self.airframe.motion
+        velocity = self._velocity.tolist()
+        rate = 1.0 / PHYSICS_STEP
+        return (
+            self.time_us,
+            self._position.tolist(),
+            velocity,
+            ((velocity[0] - m.vx) * rate, (velocity[1] - m.vy) * rate, (velocity[2] - m.vz) * rate),
+            (m.r00, m.r01, m.r02, m.r10, m.r11, m.r12, m.r20, m.r21, m.r22),
+            m.voltage,
+            tuple(m.speeds),
+        )
+
+    def _fly_on(self) -> None:
+        """Let happen what happens at a time after take-off; the clock starts when the vehicle leaves the
+        ground.
+        """
+        if not self._flying_steps and self._position[2] < self.world.standing_height + _LEFT_GROUND:
+            return
+        self._flying_steps += 1
+        airborne = self._flying_steps * PHYSICS_STEP
+        while self._ahead and self._ahead[0][0] <= airborne:
+            self._ahead.pop(0)[1](self.world)

@@ -103,6 +103,7 @@ class World:
         self.velocity = _floats(self.data.qvel)
         # A free joint's generalised force is the force in the world and the torque in the body.
         self.wrench = _floats(self.data.qfrc_applied)
+        self._mass, self._inertia = float(self.model.body_mass[1]), self.model.body_inertia[1].copy()
         mujoco.mj_forward(self.model, self.data)
 
     def step(self) -> None:
@@ -124,6 +125,20 @@ class World:
     def touching(self) -> bool:
         """Whether any part of the vehicle touches the ground."""
         return bool(self.data.ncon)
+
+    def load(self, mass: float, inertia: float) -> None:
+        """Fix a payload (kg, kg m² about every axis) to the vehicle, with its centre in the centre of mass."""
+        self._weigh(self._mass + mass, self._inertia + inertia)
+
+    def unload(self) -> None:
+        """The vehicle's own mass and inertia again."""
+        self._weigh(self._mass, self._inertia)
+
+    def _weigh(self, mass: float, inertia: np.ndarray) -> None:
+        self.model.body_mass[1] = mass
+        self.model.body_inertia[1] = inertia
+        # What contacts derive from masses follows; the scratch data keeps the present state out of it.
+        mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
 
     def energy(self) -> float:
         """Kinetic plus potential energy in J (potential zero at the ground)."""

@@ -80,7 +80,7 @@ def _sys_status(a: Autopilot) -> Any:
         _SENSORS | mav.MAV_SYS_STATUS_PREARM_CHECK,
         health,
         200,
-        round(a.simulator.estimate().battery_voltage * 1e3),
+        round(a.simulator.reported().battery_voltage * 1e3),
         round(battery.current * 100),
         round(battery.charge * 100),
         *(0, 0, 0, 0, 0, 0),
@@ -89,7 +89,7 @@ def _sys_status(a: Autopilot) -> Any:
 
 def _battery_status(a: Autopilot) -> Any:
     battery = a.simulator.airframe.battery
-    voltage = a.simulator.estimate().battery_voltage
+    voltage = a.simulator.reported().battery_voltage
     cells = round(battery.cell.volts_per_cell_volt)
     each = round(voltage * 1e3 / cells)
     return mav.MAVLink_battery_status_message(
@@ -105,7 +105,7 @@ def _battery_status(a: Autopilot) -> Any:
 
 
 def _odometry(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     x, y, z = e.position
     vx, vy, vz = e.velocity
     p, q, r = e.angular_velocity
@@ -127,7 +127,7 @@ def _odometry(a: Autopilot) -> Any:
 
 
 def _highres_imu(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     fx, fy, fz = e.specific_force
     p, q, r = e.angular_velocity
     _, _, altitude = wire.geodetic(e.position)
@@ -144,14 +144,14 @@ def _highres_imu(a: Autopilot) -> Any:
 
 
 def _attitude(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     p, q, r = e.angular_velocity
     roll, pitch, yaw = wire.euler(wire.attitude(e.quaternion))
     return mav.MAVLink_attitude_message(e.time_us // 1000, roll, pitch, yaw, p, -q, -r)
 
 
 def _attitude_quaternion(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     p, q, r = e.angular_velocity
     return mav.MAVLink_attitude_quaternion_message(
         e.time_us // 1000, *wire.attitude(e.quaternion), p, -q, -r, (1.0, 0.0, 0.0, 0.0)
@@ -168,14 +168,14 @@ def _attitude_target(a: Autopilot) -> Any:
 
 
 def _local_position(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     return mav.MAVLink_local_position_ned_message(
         e.time_us // 1000, *wire.ned(e.position), *wire.ned(e.velocity)
     )
 
 
 def _global_position(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     latitude, longitude, altitude = wire.geodetic(e.position)
     north, east, down = wire.ned(e.velocity)
     yaw = wire.euler(wire.attitude(e.quaternion))[2]
@@ -189,7 +189,7 @@ def _global_position(a: Autopilot) -> Any:
 
 
 def _gps_raw(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     latitude, longitude, altitude = wire.geodetic(e.position)
     vx, vy, _ = e.velocity
     course = math.degrees(math.atan2(vx, vy)) % 360.0
@@ -203,14 +203,14 @@ def _gps_raw(a: Autopilot) -> Any:
 
 
 def _altitude(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     z = e.position[2]
     amsl = wire.ORIGIN[2] + z
     return mav.MAVLink_altitude_message(e.time_us, amsl, amsl, z, z - a.home[2], 0.0, z)
 
 
 def _vfr_hud(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     vx, vy, vz = e.velocity
     yaw = math.degrees(wire.euler(wire.attitude(e.quaternion))[2])
     speed = math.hypot(vx, vy)
@@ -250,7 +250,7 @@ def _home(a: Autopilot) -> Any:
 
 
 def _esc_status(a: Autopilot) -> Any:
-    e = a.simulator.estimate()
+    e = a.simulator.reported()
     battery = a.simulator.airframe.battery
     turns = [round(speed * 60 / (2 * math.pi)) for speed in e.rotor_speed]
     return EscStatus(0, e.time_us, turns, [e.battery_voltage] * 4, [battery.current / 4] * 4)

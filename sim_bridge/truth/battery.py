@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from models.vehicle import Vehicle
 
@@ -27,11 +27,39 @@ class BatteryCell:
     charge: float
 
 
-def battery_for(
-    vehicle: Vehicle, hover_power: float, endurance: float = 480.0, charge: float = 0.97
-) -> BatteryCell:
-    """A battery that suits the vehicle: `endurance` s of hover at `hover_power` W, sagging 4 % under that
-    load.
+@dataclass(frozen=True)
+class BatteryState:
+    """How a battery comes to a flight: state of `charge` (0 to 1), and `age` as the factor by which its
+    internal resistance has grown (1: new).
+    """
+
+    charge: float = 0.97
+    age: float = 1.0
+
+
+FULL = BatteryState()
+"""Charged, and new."""
+
+
+def in_state(cell: BatteryCell, state: BatteryState) -> BatteryCell:
+    """The battery at a charge and an age.
+
+    A lithium-ion cell is commonly called worn out where its resistance has doubled or a fifth of its capacity is
+    gone (Barré et al., "A review on lithium-ion battery ageing mechanisms and estimations for automotive
+    applications", J. Power Sources 241, 2013); both are taken to come together, in proportion.
+    """
+    return replace(
+        cell,
+        charge=state.charge,
+        capacity=cell.capacity * max(1.0 - 0.2 * (state.age - 1.0), 0.2),
+        resistance=cell.resistance * state.age,
+        polarisation_resistance=cell.polarisation_resistance * state.age,
+    )
+
+
+def battery_for(vehicle: Vehicle, hover_power: float, endurance: float = 480.0) -> BatteryCell:
+    """A full and new battery that suits the vehicle: `endurance` s of hover at `hover_power` W, sagging 4 %
+    under that load.
     """
     current = hover_power / vehicle.nominal_voltage
     resistance = 0.04 * vehicle.nominal_voltage / current
@@ -41,7 +69,7 @@ def battery_for(
         resistance=0.7 * resistance,
         polarisation_resistance=0.3 * resistance,
         polarisation_time=8.0,
-        charge=charge,
+        charge=FULL.charge,
     )
 
 

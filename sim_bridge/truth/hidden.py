@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import ClassVar
@@ -18,6 +19,9 @@ from models.errors import InputError
 from models.vehicle import GRAVITY, Vehicle
 from sim_bridge.truth.airframe import AIR_DENSITY, Act, Airframe, Motion, Powertrain
 from sim_bridge.truth.sensors import Sensors
+from sim_bridge.world import PHYSICS_STEP, World
+
+Event = tuple[float, Callable[[World], None]]
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,8 @@ class Effect:
     units: ClassVar[dict[str, str]]
     least: float = 0.0
     most: float = math.inf
+    drawn: bool = True
+    """Whether `random` may draw it."""
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """All parameters, drawn, or around a given size."""
@@ -67,6 +73,10 @@ class Effect:
         """Let the effect act on rotors, body or sensors; `others` are the names of all that is hidden with
         it.
         """
+
+    def event(self, vehicle: Vehicle, numbers: dict[str, float]) -> Event | None:
+        """What happens to the rigid body in flight, with its time after take-off in s; None for nothing."""
+        return None
 
 
 EFFECTS: dict[str, Effect] = {}
@@ -368,10 +378,101 @@ class AccelerometerBias(Effect):
         sensors.accelerometer_bias = (numbers["x"], numbers["y"], numbers["z"])
 
 
-def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> tuple[Hidden, ...]:
-    """What to hide, from `NAME`, `NAME:SIZE`, `none` or `random` requests; the same seed hides the same.
+@register
+class EstimatorDelay(Effect):
+    """Sensors, filters, estimator and link take time: a companion is told of a moment this much later.
 
-    `random` draws `count` different effects. Raises `InputError` for an unknown name or a size out of range.
+    The messages carry the time of the moment that they tell of. The autopilot's own loops are not late: they
+    use the gyroscope itself. Not a force, so that `random` does not draw it.
+    """
+
+    name, what = "estimator_delay", "a companion is told of every moment this much later, to whole 2 ms"
+    low, high, most, drawn = 0.006, 0.014, 0.2, False
+    units: ClassVar = {"delay": "s"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """A whole number of physics steps."""
+        drawn = round(generator.uniform(self.low, self.high) / PHYSICS_STEP) * PHYSICS_STEP
+        return {"delay": drawn if size is None else size}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """The age of what is reported."""
+        sensors.delay = numbers["delay"]
+
+
+@register
+class Payload(Effect):
+    """A load picked up in flight: more mass and inertia from a time after take-off until the motors stop.
+
+    A cube as wide as a rotor's radius, its centre in the centre of mass, so that no torque comes with it. An
+    event rather than an effect of the whole flight, so that neither `random` nor `rich` hides it.
+    """
+
+    name, what = "payload", "a share of the vehicle's mass is picked up at a time after take-off"
+    low, high, most, drawn = 0.08, 0.15, 1.0, False
+    units: ClassVar = {"mass_fraction": "1", "time": "s"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """A share of the mass, after 12 s: the transfer to a trajectory's start is over, most of it is ahead."""
+        drawn = generator.uniform(self.low, self.high)
+        return {"mass_fraction": drawn if size is None else size, "time": 12.0}
+
+    def event(self, vehicle: Vehicle, numbers: dict[str, float]) -> Event:
+        """The load is fixed to the rigid body."""
+        mass = numbers["mass_fraction"] * vehicle.mass
+        inertia = mass * vehicle.rotor_radius**2 / 6.0
+        return numbers["time"], lambda world: world.load(mass, inertia)
+
+
+RICH: dict[str, tuple[float, float]] = {
+    "rotor_drag": (0.20, 0.35),
+    "parasitic_drag": (0.01, 0.03),
+    "ground_effect": (1.2, 2.0),
+    "battery_sag": (1.2, 1.8),
+    "motor_lag": (0.028, 0.040),
+    "thrust_curve": (0.15, 0.40),
+    "thrust_gain": (0.97, 1.08),
+    "estimator_delay": (0.008, 0.012),
+}
+"""Range of each effect's main number in `rich`; the sources stand in `rich`."""
+
+
+def rich(vehicle: Vehicle, seed: int) -> tuple[Hidden, ...]:
+    """Everything at once that a real 5-inch quadrotor does and its linear design does not know.
+
+    Magnitudes from measurements of such vehicles, drawn by the seed:
+
+    * rotor drag in 1/s: 0.3 to 0.5 along the axes (Faessler, Franchi, Scaramuzza, RA-L 2018, table I), 0.35 for
+      0.75 kg (Sun et al., "A comparative study of nonlinear MPC and differential-flatness-based control", T-RO
+      2022); part of either is the frame's, which is drawn separately.
+    * parasitic drag in 1/m: drag areas of 0.012 to 0.037 m² (Hoerner 1965: a bluff body of that frontal area).
+    * ground effect: radii of 1.2 to 2 propellers (Sanchez-Cuenca et al. 2017; Powers et al., "Influence of
+      aerodynamics and proximity effects in quadrotor flight", ISER 2012).
+    * battery: thrust goes with the square of the voltage of an unloaded motor and with less of a loaded one.
+    * rotor lag: 33 to 40 ms (Foehn et al., "Agilicious", Science Robotics 2022), against 20 ms of the bench.
+    * thrust curve: PX4's THR_MDL_FAC of 0.3 to 0.6 in the neighbourhood of hover.
+    * thrust gain: what a hover command read off a log, a scale and another set of propellers leave open.
+    * estimator delay: 8 to 12 ms from motion to message, motion capture and filters included.
+
+    Neither wind nor a payload is in it; hide them beside it.
+    """
+    hidden = []
+    for name, (low, high) in RICH.items():
+        generator = random.Random(f"trueflight rich {seed} {name}")
+        size = generator.uniform(low, high)
+        if name == "estimator_delay":
+            size = round(size / PHYSICS_STEP) * PHYSICS_STEP
+        hidden.append(Hidden(name, EFFECTS[name].draw(vehicle, size, generator)))
+    return tuple(hidden)
+
+
+def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> tuple[Hidden, ...]:
+    """What to hide, from `NAME`, `NAME:SIZE`, `none`, `random` or `rich` requests; the same seed hides the same.
+
+    `random` draws `count` different effects, `rich` is that of `rich()`; what follows it may override a part of
+    it. Raises `InputError` for an unknown name or a size out of range.
     """
     chosen: dict[str, Hidden] = {}
     for request in requests:
@@ -380,16 +481,21 @@ def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> 
                 raise InputError("--hidden none cannot be combined with another --hidden; drop one of them")
             return ()
         if request == "random":
-            if not 1 <= count <= len(EFFECTS):
-                raise InputError(f"--hidden-count {count} must be 1 to {len(EFFECTS)}")
+            drawable = [name for name, effect in EFFECTS.items() if effect.drawn]
+            if not 1 <= count <= len(drawable):
+                raise InputError(f"--hidden-count {count} must be 1 to {len(drawable)}")
             generator = random.Random(f"trueflight {seed}")
-            for name in generator.sample(list(EFFECTS), count):
+            for name in generator.sample(drawable, count):
                 chosen[name] = _make(name, None, vehicle, seed)
+            continue
+        if request == "rich":
+            chosen |= {one.name: one for one in rich(vehicle, seed)}
             continue
         name, colon, text = request.partition(":")
         if name not in EFFECTS:
-            close = difflib.get_close_matches(name, [*EFFECTS, "random", "none"], 1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(EFFECTS)}, random, none"
+            known = [*EFFECTS, "rich", "random", "none"]
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
             raise InputError(f"--hidden {request}: unknown effect '{name}'; {hint}")
         effect, size = EFFECTS[name], None
         if colon:
@@ -425,3 +531,9 @@ def install(
     for one in hidden:
         EFFECTS[one.name].attach(airframe, sensors, one.parameters, names)
     return train, airframe
+
+
+def after_takeoff(hidden: tuple[Hidden, ...], vehicle: Vehicle) -> list[Event]:
+    """What happens to the rigid body in flight, in the order of its times after take-off (s)."""
+    events = (EFFECTS[one.name].event(vehicle, one.parameters) for one in hidden)
+    return sorted((event for event in events if event is not None), key=lambda event: event[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -55,13 +56,16 @@ _BLOCK, _DRAWS = 1024, 25
 
 
 class Sensors:
-    """Draws every sample's errors from one seeded generator; `accelerometer_bias` (m/s², body) is a hidden
-    effect.
+    """Draws every sample's errors from one seeded generator.
+
+    `accelerometer_bias` (m/s², body) and `delay` (s, from a moment to its sample's arrival at a companion) are
+    hidden effects.
     """
 
     def __init__(self, noise: Noise, seed: int) -> None:
         self.noise = noise
         self.accelerometer_bias = (0.0, 0.0, 0.0)
+        self.delay = 0.0
         self._generator = np.random.default_rng([seed, 0x5E45])
         self._rows: list[list[float]] = []
         self._wander = [float(x) for x in self._generator.standard_normal(9)]
@@ -75,7 +79,7 @@ class Sensors:
         acceleration: tuple[float, float, float],
         rotation: tuple[float, ...],
         voltage: float,
-        speeds: list[float],
+        speeds: Sequence[float],
     ) -> Estimate:
         """One sample. `position` is x, y, z, quaternion and `velocity` linear (world) and angular (body), as
         in `World`.
@@ -89,11 +93,14 @@ class Sensors:
         n = self._rows.pop()
         noise = self.noise
         wander = self._wander
-        decay = math.exp((self._last_us - time_us) * 1e-6 / noise.wander_time)
-        self._last_us = time_us
-        kick = math.sqrt(max(1.0 - decay * decay, 0.0))
-        for i in range(9):
-            wander[i] = decay * wander[i] + kick * n[i]
+        elapsed = time_us - self._last_us
+        # The autopilot's own sample may be newer than the one that a companion is told next.
+        if elapsed > 0:
+            self._last_us = time_us
+            decay = math.exp(elapsed * -1e-6 / noise.wander_time)
+            kick = math.sqrt(1.0 - decay * decay)
+            for i in range(9):
+                wander[i] = decay * wander[i] + kick * n[i]
         x, y, z, qw, qx, qy, qz = position
         vx, vy, vz, p, q, r = velocity
         sp, sw = noise.position, noise.position_wander
