@@ -8,7 +8,8 @@ import csv
 import difflib
 import io
 import math
-from collections.abc import Callable
+import random
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,6 +122,9 @@ def _checked(name: str, parameter: Parameter, value: object) -> float | str:
     return number
 
 
+_FLOOR = 0.3
+"""m above ground: no step of a random direction ends lower."""
+
 HEIGHT = Parameter("height", 1.2, 0.1, 50.0, "m", "height above ground")
 YAW = Parameter("yaw", 0.0, -2 * math.pi, 2 * math.pi, "rad", "yaw, zero along world x (east)")
 SPEED = Parameter("speed", 2.0, 0.05, 15.0, "m/s", "greatest reference speed")
@@ -156,6 +160,78 @@ for _axis, _name in enumerate(("x", "y", "z", "yaw")):
         Parameter("count", 1.0, 1.0, 100.0, "", "how often there and back"),
         YAW,
     )(_step(_axis))
+
+
+_SEED = Parameter("seed", 1.0, 0.0, 2.0**31, "", "another number is another order and other sizes")
+_DIRECTIONS = tuple(
+    (dx, dy, dz) for dx in (-1, 0, 1) for dy in (-1, 0, 1) for dz in (-1, 0, 1) if (dx, dy, dz) != (0, 0, 0)
+)
+"""The 26 neighbours of a point: along every axis, every diagonal of a plane, and every diagonal of space."""
+
+
+def _beside(base: Waypoint, direction: Sequence[float], size: float) -> Waypoint:
+    """The waypoint `size` m from `base` along a direction of any length."""
+    length = math.hypot(*direction)
+    x, y, z = (b + size * d / length for b, d in zip(base[:3], direction, strict=True))
+    return (x, y, z, base[3])
+
+
+@_kind(
+    "steps",
+    "steps of the position reference in all directions of space, each there and back, in an order of the seed",
+    Parameter("size", 0.8, 0.05, 3.0, "m", "greatest size of a step; the smallest is half of it"),
+    HEIGHT,
+    Parameter("time", 2.5, 0.5, 60.0, "s", "time between two steps"),
+    Parameter("count", 7.0, 1.0, 100.0, "", "how many there and back"),
+    YAW,
+    _SEED,
+)
+def _steps(size: float, height: float, time: float, count: float, yaw: float, seed: float) -> list[Segment]:
+    generator = random.Random(f"steps {int(seed)}")
+    base: Waypoint = (0.0, 0.0, height, yaw)
+    segments: list[Segment] = [hold(base, 1.0)]
+    order: list[tuple[int, int, int]] = []
+    for _ in range(int(count)):
+        order = order or generator.sample(_DIRECTIONS, len(_DIRECTIONS))
+        there = _beside(base, order.pop(), size * generator.uniform(0.5, 1.0))
+        # A step that would end below the ground or close above it is mirrored.
+        there = (*there[:2], max(there[2], 2 * height - there[2]) if there[2] < _FLOOR else there[2], yaw)
+        segments += [hold(there, time), hold(base, time)]
+    return segments
+
+
+@_kind(
+    "scenario",
+    "steps of 0.5 to 1 m along every axis and smooth translations in every plane, about 40 s, in the style of the "
+    "paper's figure 6; order, sizes and directions are the seed's",
+    _SEED,
+    Parameter("height", 1.5, 1.3, 50.0, "m", "height above ground"),
+    Parameter("speed", 1.5, 0.2, 4.0, "m/s", "greatest reference speed of the translations"),
+    YAW,
+)
+def _scenario(seed: float, height: float, speed: float, yaw: float) -> list[Segment]:
+    generator = random.Random(f"scenario {int(seed)}")
+    base: Waypoint = (0.0, 0.0, height, yaw)
+
+    def size() -> float:
+        return generator.choice((-1.0, 1.0)) * generator.uniform(0.5, 1.0)
+
+    parts: list[list[Segment]] = []
+    for axis in range(3):
+        direction = [0.0, 0.0, 0.0]
+        direction[axis] = 1.0
+        parts.append([hold(_beside(base, direction, size()), 2.5), hold(base, 2.5)])
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        corners = [list(base[:3]) for _ in range(3)]
+        a, b = 1.5 * size(), size() if second == 2 else 1.5 * size()
+        corners[0][first] += a
+        corners[1][first] += a
+        corners[1][second] += b
+        corners[2][second] += b
+        points: list[Waypoint] = [base, *((x, y, z, yaw) for x, y, z in corners), base]
+        parts.append(path(points, speed, ACCELERATION, 0.3))
+    generator.shuffle(parts)
+    return [hold(base, 1.0), *(segment for part in parts for segment in part), hold(base, 1.0)]
 
 
 @_kind(
