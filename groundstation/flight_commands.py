@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,6 +15,7 @@ from rich.markup import escape
 from models.errors import InputError
 
 if TYPE_CHECKING:
+    from groundstation.linear_design import Loop
     from groundstation.tracking import Tracking
     from models.flight import Flight
 
@@ -202,9 +204,13 @@ def design_command(
     bandwidth: Annotated[float | None, typer.Option(help="Position loop, Hz.")] = None,
     attitude_bandwidth: Annotated[float | None, typer.Option(help="Attitude loop, Hz.")] = None,
     rate: Annotated[float, typer.Option(help="Control rate, Hz.")] = 100.0,
+    keep: Annotated[
+        Path | None, typer.Option("--keep", help="Keep the gains of this design, add only its integral loop.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Gains of the linear cascade by LQR, for the companion, and what the closed loop will do."""
+    """Gains of the linear cascade by LQR, with and without integral, and what the closed loop will do."""
+    from groundstation.integral_design import integral_loops, with_integral
     from groundstation.linear_design import (
         ATTITUDE_BANDWIDTH,
         POSITION_BANDWIDTH,
@@ -212,13 +218,19 @@ def design_command(
         loops,
         make_design,
     )
-    from models.design import save_design
+    from models.design import load_design, save_design
     from models.vehicle import load_vehicle
 
     believed = load_vehicle(vehicle)
-    design = make_design(
-        believed, bandwidth or POSITION_BANDWIDTH, attitude_bandwidth or ATTITUDE_BANDWIDTH, rate
-    )
+    if keep is not None:
+        if bandwidth is not None or attitude_bandwidth is not None:
+            raise InputError("--keep: the gains are those of the file; leave out --bandwidth")
+        design = load_design(keep, believed)
+    else:
+        design = make_design(
+            believed, bandwidth or POSITION_BANDWIDTH, attitude_bandwidth or ATTITUDE_BANDWIDTH, rate
+        )
+    design = with_integral(design, believed)
     target = output or vehicle.with_name("design.json")
     partial = target.with_name(f".{target.name}.part")
     try:
@@ -228,7 +240,7 @@ def design_command(
         raise InputError(f"{target}: cannot write the design ({error.strerror}); choose another -o") from None
     finally:
         partial.unlink(missing_ok=True)
-    found = loops(design, believed)
+    found, integral = loops(design, believed), integral_loops(design, believed)
     if as_json:
         typer.echo(
             json.dumps(
@@ -236,17 +248,18 @@ def design_command(
                     "design": str(target),
                     "K_zeta": design.K_zeta,
                     "K_eta": design.K_eta,
-                    "loops": [
+                    "integral": None if design.integral is None else asdict(design.integral),
+                    "loops": [_loop_row(loop) for loop in found],
+                    "integral_loops": [
                         {
-                            "name": loop.name,
-                            "poles": [[p.real, p.imag] for p in loop.poles],
-                            "crossover": loop.crossover,
-                            "phase_margin_deg": loop.phase_margin,
-                            "rise_time": loop.rise_time,
-                            "settling_time": loop.settling_time,
-                            "overshoot": loop.overshoot,
+                            **_loop_row(i.loop),
+                            "disturbance_removed_after": i.removal,
+                            "disturbance_allowed": i.allowed,
+                            "disturbance_peak": i.peak,
+                            "step_distance_to_lqr": i.step_distance,
+                            "translation_distance_to_lqr": i.translation_distance,
                         }
-                        for loop in found
+                        for i in integral
                     ],
                 },
                 indent=1,
@@ -255,7 +268,7 @@ def design_command(
         return
     from rich.table import Table
 
-    delay, lag = actuation(believed, rate)
+    delay, lag = actuation(believed, design.rate)
     table = Table(title=f"{believed.name}: closed loop, step of the reference")
     for heading in (
         "loop",
@@ -266,9 +279,10 @@ def design_command(
         f"margin at {1e3 * delay:.0f} + {1e3 * lag:.0f} ms",
     ):
         table.add_column(heading, justify="left" if heading in ("loop", "poles (1/s)") else "right")
-    for loop in found:
+    shown = [(loop.name, loop) for loop in found] + [(f"{i.loop.name} + i", i.loop) for i in integral]
+    for name, loop in shown:
         table.add_row(
-            loop.name,
+            name,
             _poles(loop.poles),
             f"{loop.rise_time:.2f} s",
             f"{loop.settling_time:.2f} s",
@@ -283,7 +297,31 @@ def design_command(
         f"{k_eta[2][5]:.2f} N s/m",
         highlight=False,
     )
+    table = Table(title="with integral (lqr_integral), a constant disturbance and the distance to lqr, 1 m")
+    for heading in ("loop", "gone after", "peak", "step, rms", "translation, rms"):
+        table.add_column(heading, justify="left" if heading == "loop" else "right")
+    for i in integral:
+        table.add_row(
+            f"{i.loop.name} + i",
+            f"{i.removal:.1f} s of {i.allowed:.1f} s",
+            f"{100 * i.peak:.0f} % of lqr's",
+            f"{100 * i.step_distance:.1f} cm",
+            f"{100 * i.translation_distance:.1f} cm",
+        )
+    console.print(table)
     console.print(f"design: {escape(str(target))}")
+
+
+def _loop_row(loop: Loop) -> dict[str, Any]:
+    return {
+        "name": loop.name,
+        "poles": [[p.real, p.imag] for p in loop.poles],
+        "crossover": loop.crossover,
+        "phase_margin_deg": loop.phase_margin,
+        "rise_time": loop.rise_time,
+        "settling_time": loop.settling_time,
+        "overshoot": loop.overshoot,
+    }
 
 
 def _poles(poles: tuple[complex, ...]) -> str:

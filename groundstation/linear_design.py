@@ -159,18 +159,19 @@ def loops(design: Design, vehicle: Vehicle) -> tuple[Loop, ...]:
         ),
         "vertical": ([p_z], [1.0, v_z, p_z]),
     }
-    return tuple(_loop(name, w, open_loops[name], *ideal[name]) for name in open_loops)
+    return tuple(loop_figures(name, w, open_loops[name], *ideal[name]) for name in open_loops)
 
 
-def _loop(
+def loop_figures(
     name: str, w: np.ndarray, gain: np.ndarray, numerator: list[float], denominator: list[float]
 ) -> Loop:
+    """A loop from its open-loop response `gain` (W,), complex, at `w` (W,) rad/s with delay and lag, and the transfer
+    function from reference to position of the ideal closed one."""
     from scipy import signal
 
     size = np.abs(gain)
     last = int(np.flatnonzero(size >= 1.0)[-1]) if np.any(size >= 1.0) else 0
     phase = np.unwrap(np.angle(gain))
-    margin = 180.0 + math.degrees(float(phase[last]))
     slowest = float(np.min(np.abs(np.roots(denominator).real)))
     t, y = signal.step((numerator, denominator), T=np.linspace(0.0, 12.0 / slowest, 4000))
     y = y / y[-1]
@@ -179,11 +180,16 @@ def _loop(
         name,
         tuple(complex(p) for p in np.roots(denominator)),
         float(w[last]),
-        margin,
+        wrapped_margin(float(phase[last])),
         float(t[np.argmax(y >= 0.9)] - t[np.argmax(y >= 0.1)]),
         float(t[outside[-1]]) if outside.size else 0.0,
         float(max(0.0, y.max() - 1.0)),
     )
+
+
+def wrapped_margin(phase: float) -> float:
+    """Phase margin in degrees, -180 to 180, of the phase (rad, any number of turns) at the crossover."""
+    return math.degrees(phase) % 360.0 - 180.0
 
 
 def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:

@@ -20,13 +20,26 @@ _MASS_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
+class IntegralGains:
+    """Gains of the position loop with an integral, the paper's third controller.
+
+    `u = -K_eta eta - K_i integral(xi - xi_ref) dt + inv(A_zeta) x2ref_dot`, heading frame: `K_eta` (3, 6) as in
+    `Design`, `K_i` (3, 3) maps the integral (m s) to `(phi, theta, T)` in rad, rad, N.
+    """
+
+    K_eta: Matrix
+    K_i: Matrix
+
+
+@dataclass(frozen=True)
 class Design:
     """Gains of the paper's cascade, (13) and (16), with what gave them.
 
     `K_zeta` (3, 3) in 1/s maps the attitude error (roll, pitch, yaw; rad) to body rates. `K_eta` (3, 6) maps
     `(xi - xi_ref, v - v_ref)` in the heading frame (m, m/s) to `(phi, theta, T)` in rad, rad, N. `weights`
     holds the LQR weights Q and R of both loops, `rate` is the control rate in Hz they were chosen for, `mass`
-    in kg is that of the vehicle.
+    in kg is that of the vehicle. `integral` is the position loop of the controller `lqr_integral`, where the
+    design has one; it shares the attitude loop.
     """
 
     vehicle: str
@@ -36,6 +49,7 @@ class Design:
     weights: dict[str, Any] = field(default_factory=dict)
     rate: float = 100.0
     created_by: str = ""
+    integral: IntegralGains | None = None
 
     def check(self, vehicle: Vehicle, where: str = "design") -> None:
         """Raise `InputError` where the design belongs to another vehicle (by name or mass)."""
@@ -63,7 +77,10 @@ def save_design(design: Design, path: str | Path) -> None:
 
 def design_to_json(design: Design) -> str:
     """The text of a design file."""
-    return json.dumps(asdict(design), indent=1) + "\n"
+    table = asdict(design)
+    if design.integral is None:
+        del table["integral"]
+    return json.dumps(table, indent=1) + "\n"
 
 
 def load_design(path: str | Path, vehicle: Vehicle | None = None) -> Design:
@@ -112,9 +129,21 @@ def design_from_json(text: str, where: str = "design") -> Design:
         weights=table.get("weights", {}),
         rate=_positive(where, "rate", table.get("rate", 100.0)),
         created_by=table.get("created_by", ""),
+        integral=_integral(where, table.get("integral")),
     )
     _check_stability(design, where)
     return design
+
+
+def _integral(where: str, table: object) -> IntegralGains | None:
+    if table is None:
+        return None
+    if not isinstance(table, dict) or set(table) != {"K_eta", "K_i"}:
+        raise InputError(f"{where}: 'integral' must be an object with K_eta and K_i, and nothing else")
+    return IntegralGains(
+        _matrix(where, "integral.K_eta", table["K_eta"], (3, 6)),
+        _matrix(where, "integral.K_i", table["K_i"], (3, 3)),
+    )
 
 
 def _positive(where: str, key: str, value: object) -> float:
@@ -139,11 +168,17 @@ def _matrix(where: str, key: str, value: object, shape: tuple[int, int]) -> Matr
 
 
 def _check_stability(design: Design, where: str) -> None:
-    """Both loops of the linear design must be stable, or the file has a wrong sign or a wrong row order."""
+    """Every loop of the linear design must be stable, or the file has a wrong sign or a wrong row order."""
     a = np.zeros((6, 6))
     a[:3, 3:] = np.eye(3)
     b = np.vstack([np.zeros((3, 3)), hover_input_matrix(design.mass)])
     loops = {"K_zeta": -np.array(design.K_zeta), "K_eta": a - b @ np.array(design.K_eta)}
+    if design.integral is not None:
+        # Nine states: the integral of the position error drives the position loop too.
+        closed = np.zeros((9, 9))
+        closed[:6, :6] = a - b @ np.array(design.integral.K_eta)
+        closed[:6, 6:], closed[6:, :3] = -b @ np.array(design.integral.K_i), np.eye(3)
+        loops["integral"] = closed
     for key, closed in loops.items():
         slowest = float(np.linalg.eigvals(closed).real.max())
         if slowest >= 0.0:
