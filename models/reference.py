@@ -205,8 +205,8 @@ def _steps(size: float, height: float, time: float, count: float, yaw: float, se
     "steps of 0.5 to 1 m along every axis and smooth translations in every plane, about 40 s, in the style of the "
     "paper's figure 6; order, sizes and directions are the seed's",
     _SEED,
-    Parameter("height", 1.5, 1.3, 50.0, "m", "height above ground"),
-    Parameter("speed", 1.5, 0.2, 4.0, "m/s", "greatest reference speed of the translations"),
+    Parameter("height", 1.8, 1.3, 50.0, "m", "height above ground"),
+    Parameter("speed", 2.0, 0.2, 4.0, "m/s", "greatest reference speed of the translations"),
     YAW,
 )
 def _scenario(seed: float, height: float, speed: float, yaw: float) -> list[Segment]:
@@ -223,7 +223,7 @@ def _scenario(seed: float, height: float, speed: float, yaw: float) -> list[Segm
         parts.append([hold(_beside(base, direction, size()), 2.5), hold(base, 2.5)])
     for first, second in ((0, 1), (0, 2), (1, 2)):
         corners = [list(base[:3]) for _ in range(3)]
-        a, b = 1.5 * size(), size() if second == 2 else 1.5 * size()
+        a, b = 2.5 * size(), size() if second == 2 else 2.5 * size()
         corners[0][first] += a
         corners[1][first] += a
         corners[1][second] += b
