@@ -47,7 +47,8 @@ class FlightRecorder:
     (a power cut, SIGKILL) leaves a readable file that misses at most the last chunk.
 
     `metadata` is free text by key, written at the beginning. `queue_limit` is the greatest number of messages
-    that wait for the disk. Raises `InputError` where the file cannot be made.
+    that wait for the disk. A `simulated` flight has no wall clock: nothing in its file depends on when and how
+    fast it was written. Raises `InputError` where the file cannot be made.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class FlightRecorder:
         design: Design | None = None,
         metadata: dict[str, str] | None = None,
         queue_limit: int = 4096,
+        simulated: bool = False,
     ) -> None:
         self.path = Path(path)
         self.dropped = 0
@@ -67,7 +69,8 @@ class FlightRecorder:
         except OSError as error:
             raise InputError(f"{path}: cannot write the flight record ({error.strerror})") from None
         self._queue: queue.Queue[tuple[int, int, int, bytes] | None] = queue.Queue(queue_limit)
-        self._epoch = time.time_ns() - time.monotonic_ns()
+        now = 0 if simulated else time.time_ns()
+        self._epoch = 0 if simulated else now - time.monotonic_ns()
         self._sequence = [0, 0]
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="trueflight", library="trueflight")
@@ -78,10 +81,8 @@ class FlightRecorder:
             name = kind.DESCRIPTOR.full_name
             schema = self._writer.register_schema(name, "protobuf", schemas.SerializeToString())
             self._channels.append(self._writer.register_channel(topic, "protobuf", schema))
-        now = time.time_ns()
-        self._writer.add_metadata(
-            "flight", {"vehicle": vehicle.name, "created_ns": str(now), **(metadata or {})}
-        )
+        created = {} if simulated else {"created_ns": str(now)}
+        self._writer.add_metadata("flight", {"vehicle": vehicle.name, **created, **(metadata or {})})
         self._writer.add_attachment(
             now, now, "vehicle.toml", "application/toml", vehicle_to_toml(vehicle).encode()
         )
