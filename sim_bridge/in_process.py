@@ -194,7 +194,9 @@ def record(
     metadata = {"created_by": "sim-bridge fly", "trajectory": plan.trajectory.name}
     # Written after the flight: the recorder's thread would share the interpreter with the simulation and
     # halve its speed. All of the flight has room in the queue, so that nothing is dropped.
-    recorder = FlightRecorder(path, plan.vehicle, plan.design, metadata, queue_limit=int(expected) + 100)
+    recorder = FlightRecorder(
+        path, plan.vehicle, plan.design, metadata, queue_limit=int(expected) + 100, simulated=True
+    )
     tick = _TickWriter(plan)
     rows: list[tuple[float, ...]] = []
 
@@ -227,7 +229,7 @@ def record(
 
 class _TickWriter:
     """Turns samples into the protobuf ticks that the companion writes: `messages` with both clocks (us,
-    ns).
+    ns), which are one: simulated time.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -252,7 +254,7 @@ class _TickWriter:
         """Write one tick."""
         tick, now, control, reference = self._tick, sample.estimate, sample.step, sample.reference
         self.time_us = tick.vehicle_time_us = now.time_us
-        tick.host_time_ns = host = time.monotonic_ns()
+        tick.host_time_ns = host = 1000 * now.time_us
         v = tick.position
         v.x, v.y, v.z = sample.position
         v = tick.velocity
