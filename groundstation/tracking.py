@@ -44,8 +44,13 @@ class Tracking:
         return float(np.sqrt(sum(self.mse)))
 
 
-def track_file(path: Path, design: Path | None = None, vehicle: Path | None = None) -> Tracking:
-    """Read a flight and track it; the design is that of the record unless given. Raises `InputError`."""
+def read_designed(
+    path: Path, design: Path | None = None, vehicle: Path | None = None
+) -> tuple[Flight, Design, str]:
+    """A flight, the design it is measured against (that of the record unless given) and its label.
+
+    Raises `InputError`.
+    """
     label = path.stem
     flight = read_flight(path, vehicle)
     if path.suffix.lower() == ".mcap":
@@ -55,12 +60,17 @@ def track_file(path: Path, design: Path | None = None, vehicle: Path | None = No
         controller = record.metadata.get("controller", "")
         label = f"{record.metadata.get('trajectory', path.stem)} {controller}".strip()
         if design is None and record.design is not None:
-            return track(flight, record.design, label)
+            return flight, record.design, label
     if design is None:
         raise InputError(
             f"{path}: the flight carries no design; pass --design FILE (`groundstation design` makes one)"
         )
-    return track(flight, load_design(design, flight.vehicle), label)
+    return flight, load_design(design, flight.vehicle), label
+
+
+def track_file(path: Path, design: Path | None = None, vehicle: Path | None = None) -> Tracking:
+    """Read a flight and track it; the design is that of the record unless given. Raises `InputError`."""
+    return track(*read_designed(path, design, vehicle))
 
 
 def told_apart(tracked: Sequence[Tracking]) -> list[Tracking]:
@@ -82,35 +92,17 @@ def track(flight: Flight, design: Design, label: str = "") -> Tracking:
     zeta = euler_from_quaternion(flight.column("quaternion"))
     wanted = flight.column("position_reference")
     n = len(flight)
-    counts = np.ones(n, bool) if flight.flying is None else flight.flying.copy()
-    if "mission" in flight.extra:
-        counts &= flight.extra["mission"] > 0.5
-    parts: list[np.ndarray] = []
     expected, angles = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-    for rows in _stretches(flight.t, counts):
-        t = flight.t[rows]
-        speed = (
-            flight.velocity_reference[rows]
-            if flight.velocity_reference is not None
-            else _slope(t, wanted[rows])
-        )
-        change = (
-            flight.acceleration_reference[rows]
-            if flight.acceleration_reference is not None
-            else _slope(t, speed)
-        )
-        yaw = flight.yaw_reference[rows] if flight.yaw_reference is not None else np.zeros(len(rows))
-        reference = Reference(wanted[rows], speed, change, yaw)
+    flown = missions(flight)
+    for rows in flown:
         behaviour = expected_behaviour(
-            design, t, reference, (position[rows[0]], velocity[rows[0]], zeta[rows[0]])
+            design,
+            flight.t[rows],
+            reference_of(flight, rows),
+            (position[rows[0]], velocity[rows[0]], zeta[rows[0]]),
         )
         expected[rows], angles[rows] = behaviour.position, behaviour.zeta
-        parts.append(rows)
-    if not parts:
-        raise InputError(
-            f"{flight.origin}: no mission of {SHORTEST:g} s in it; fly a trajectory (`groundstation fly`)"
-        )
-    rows = np.concatenate(parts)
+    rows = np.concatenate(flown)
     miss = position[rows] - expected[rows]
     turn = wrap_angle(zeta[rows] - angles[rows])
     return Tracking(
@@ -127,19 +119,39 @@ def track(flight: Flight, design: Design, label: str = "") -> Tracking:
     )
 
 
-def _stretches(t: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
+def missions(flight: Flight) -> list[np.ndarray]:
+    """Row numbers of each unbroken stretch that counts: in the air, on a mission where the flight tells.
+
+    Raises `InputError` where none lasts `SHORTEST` s.
+    """
+    counts = np.ones(len(flight), bool) if flight.flying is None else flight.flying.copy()
+    if "mission" in flight.extra:
+        counts &= flight.extra["mission"] > 0.5
     out = []
-    for part in segments(t):
+    for part in segments(flight.t):
         inside = np.concatenate([[0], counts[part].astype(np.int8), [0]])
         edges = np.flatnonzero(np.diff(inside)) + part.start
         for a, b in zip(edges[::2], edges[1::2], strict=True):
-            if t[b - 1] - t[a] >= SHORTEST:
+            if flight.t[b - 1] - flight.t[a] >= SHORTEST:
                 out.append(np.arange(a, b))
+    if not out:
+        raise InputError(
+            f"{flight.origin}: no mission of {SHORTEST:g} s in it; fly a trajectory (`groundstation fly`)"
+        )
     return out
 
 
-def _slope(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.gradient(values, t, axis=0)
+def reference_of(flight: Flight, rows: np.ndarray) -> Reference:
+    """The reference over the rows of one stretch; what the flight does not tell is differentiated, yaw is 0."""
+    t, position = flight.t[rows], flight.column("position_reference")[rows]
+    velocity, acceleration, yaw = (
+        flight.velocity_reference,
+        flight.acceleration_reference,
+        flight.yaw_reference,
+    )
+    speed = velocity[rows] if velocity is not None else np.gradient(position, t, axis=0)
+    change = acceleration[rows] if acceleration is not None else np.gradient(speed, t, axis=0)
+    return Reference(position, speed, change, yaw[rows] if yaw is not None else np.zeros(len(rows)))
 
 
 def _mean_square(error: np.ndarray) -> tuple[float, float, float]:
