@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +19,6 @@ from sim_bridge.settings import Settings, load_settings
 
 if TYPE_CHECKING:
     from sim_bridge.autopilot import Autopilot
-    from sim_bridge.in_process import Sample
     from sim_bridge.truth.hidden import Hidden
 
 app = typer.Typer(
@@ -233,8 +235,9 @@ def fly(
         settings.battery,
     )
     csv_file = output.with_suffix(".csv") if table else None
-    with _Progress(plan.repeat * plan.trajectory.duration * rate, as_json) as progress:
-        flown = record(plan, output, csv_file, progress)
+    seconds = plan.repeat * plan.trajectory.duration
+    with _Progress(seconds, as_json) as progress:
+        flown = record(plan, output, csv_file, lambda sample: progress.add(1.0 / rate))
     told = _seal(settings, plan.hidden, believed, output.with_suffix(".sealed"))
     report = {
         "record": str(output),
@@ -281,13 +284,13 @@ def _bytes(path: Path) -> bytes:
 
 
 class _Progress:
-    """A bar on standard error for long flights; called with every sample."""
+    """A bar on standard error for long flights, in seconds of flight."""
 
-    def __init__(self, ticks: float, quiet: bool) -> None:
-        self._ticks, self._count = ticks, 0
+    def __init__(self, seconds: float, quiet: bool) -> None:
+        self._seconds, self._done, self._shown = seconds, 0.0, 0.0
         self._bar: Any = None
-        # Some 10 000 ticks fly in a second: below that a bar would only flicker.
-        if ticks > 10_000 and not quiet and sys.stderr.isatty():
+        # A hundred fly in a second: below that a bar would only flicker.
+        if seconds > 100.0 and not quiet and sys.stderr.isatty():
             from rich.console import Console
             from rich.progress import Progress
 
@@ -296,17 +299,143 @@ class _Progress:
     def __enter__(self) -> _Progress:
         if self._bar is not None:
             self._bar.start()
-            self._task = self._bar.add_task("flying", total=self._ticks)
+            self._task = self._bar.add_task("flying", total=self._seconds)
         return self
 
     def __exit__(self, *caught: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
-    def __call__(self, sample: Sample) -> None:
-        self._count += 1
-        if self._bar is not None and self._count % 1000 == 0:
-            self._bar.update(self._task, completed=self._count)
+    def add(self, seconds: float) -> None:
+        """So much more has been flown."""
+        self._done += seconds
+        if self._bar is not None and self._done - self._shown >= 10.0:
+            self._shown = self._done
+            self._bar.update(self._task, completed=self._done)
+
+
+@app.command(
+    epilog="Example: sim-bridge collect --vehicle vehicle.toml --hidden rich --seed 1 --minutes 30 -o database"
+)
+def collect(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder of the records: new, or to continue.")
+    ],
+    vehicle: VehicleFile = None,
+    config: Config = None,
+    design: Annotated[
+        Path | None, typer.Option(help="Design file; otherwise design.json beside the vehicle.")
+    ] = None,
+    minutes: Annotated[float, typer.Option(help="Flight time to collect, at least.")] = 30.0,
+    model: Annotated[
+        Path | None, typer.Option(help="ONNX model; the guarded correction then flies with it.")
+    ] = None,
+    rate: Annotated[float, typer.Option(help="Control rate, Hz.")] = 100.0,
+    hidden: HiddenNames = None,
+    hidden_count: HiddenCount = None,
+    seed: Seed = None,
+    sealed: Sealed = None,
+    noise: NoiseScale = None,
+    battery_age: BatteryAge = None,
+    jobs: Annotated[int, typer.Option(help="Processes; 0: one for each core.", min=0, max=256)] = 0,
+    as_json: Json = False,
+) -> None:
+    """Fly a whole training database in-process: one record each of translations, steps, rotations, spirals, circles,
+    lemniscates, low passes and surveys, on batteries from full to nearly empty.
+
+    `--seed` draws the truth, the flights and their noise. What was flown stays when interrupted; the same command
+    continues.
+    """
+    names = ("vehicle", "design", "hidden", "hidden_count", "seed", "sealed", "noise", "battery_age")
+    settings = load_settings(config, {name: value for name, value in locals().items() if name in names})
+    believed = load_vehicle(settings.vehicle)
+    from models.database import Collection, database
+    from models.design import load_design
+    from sim_bridge.collect import collect as fly_all
+    from sim_bridge.collect import fingerprint, flights
+    from sim_bridge.in_process import Plan
+    from sim_bridge.truth.hidden import choose
+
+    gains = Path(settings.design) if settings.design else Path(settings.vehicle).with_name("design.json")
+    sorties = database(settings.seed, minutes)
+    plan = Plan(
+        believed,
+        load_design(gains, believed),
+        sorties[0].path,
+        choose(list(settings.hidden), believed, settings.seed, settings.hidden_count),
+        settings.seed,
+        rate=rate,
+        model=None if model is None else _bytes(model),
+        noise=settings.sensor_noise,
+        battery=settings.battery,
+    )
+    _ = plan.steps_per_tick  # a rate that cannot be flown is told before anything is written
+    asked = {"hidden": settings.hidden, "seed": settings.seed, "minutes": minutes, "rate": rate}
+    asked |= {"noise": settings.noise, "battery_age": settings.battery_age, "fingerprint": fingerprint(plan)}
+    collection = Collection(output, {"flown_by": "sim-bridge collect", "vehicle": believed.name, **asked})
+    told = _seal(settings, plan.hidden, believed, output / "hidden.sealed")
+    wanted = flights(sorties, plan)
+    already, begin = len(collection.flown), time.perf_counter()
+    total = sum(sortie.path.duration for sortie in sorties)
+    with _Progress(total, as_json) as progress:
+        progress.add(sum(entry["seconds"] for entry in collection.flown.values()))
+        try:
+            for _, entry in fly_all(wanted, collection, jobs or len(os.sched_getaffinity(0))):
+                progress.add(entry["seconds"])
+        except KeyboardInterrupt:
+            raise InputError(
+                f"interrupted: {len(collection.flown)} of {len(wanted)} flights are in {output}; the same command "
+                "continues"
+            ) from None
+    wall = time.perf_counter() - begin
+    entries = [collection.flown[flight.name] for flight in wanted]
+    seconds = sum(entry["seconds"] for entry in entries)
+    new = len(entries) - already
+    report = {
+        "folder": str(output),
+        "flights": collection.flown,
+        "seconds": seconds,
+        "flown_now": new,
+        "wall": wall,
+        "sealed": str(told) if told else None,
+    }
+    text = (
+        f"{output}: {len(entries)} flights, {seconds / 60:.1f} min, {new} of them now in {wall:.1f} s; "
+        f"{_told(settings, told)}"
+    )
+    if as_json:
+        _tell(report, text, as_json)
+        return
+    _print_collected(entries)
+    typer.echo(text)
+
+
+def _print_collected(entries: list[dict[str, Any]]) -> None:
+    """One row for each trajectory: how often, how long, how far from the reference."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table()
+    for column in ("trajectory", "flights", "s", "charge", "RMS x, y, z (m)", "on ground", "not finished"):
+        table.add_column(column, justify="left" if column == "trajectory" else "right", no_wrap=True)
+    for name in sorted({entry["trajectory"] for entry in entries}):
+        of = [entry for entry in entries if entry["trajectory"] == name]
+        ticks = sum(entry["ticks"] for entry in of)
+        errors = (
+            math.sqrt(sum(entry["ticks"] * entry["rms_error"][i] ** 2 for entry in of) / ticks)
+            for i in range(3)
+        )
+        charges = [entry["charge"] for entry in of]
+        table.add_row(
+            name,
+            str(len(of)),
+            f"{sum(entry['seconds'] for entry in of):.0f}",
+            f"{min(charges):.2f} to {max(charges):.2f}",
+            ", ".join(f"{error:.3f}" for error in errors),
+            f"{sum(entry['ticks_on_ground'] for entry in of) / ticks:.1%}",
+            str(sum(entry["outcome"] != "finished" for entry in of) or ""),
+        )
+    Console(width=100).print(table)
 
 
 @app.command(epilog="Example: sim-bridge reveal hidden.sealed --json")

@@ -191,7 +191,8 @@ def record(
     `on_sample` is called after each tick was taken down. Raises `InputError` where a file cannot be written.
     """
     expected = plan.repeat * (plan.trajectory.duration + 60.0) * plan.rate
-    metadata = {"created_by": "sim-bridge fly", "trajectory": plan.trajectory.name}
+    parameters = {f"parameter.{key}": str(value) for key, value in plan.trajectory.parameters.items()}
+    metadata = {"created_by": "sim-bridge", "trajectory": plan.trajectory.name, **parameters}
     # Written after the flight: the recorder's thread would share the interpreter with the simulation and
     # halve its speed. All of the flight has room in the queue, so that nothing is dropped.
     recorder = FlightRecorder(

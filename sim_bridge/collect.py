@@ -1,0 +1,118 @@
+"""A training database flown in-process: every flight of `models.database`, each into its own record."""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from models.database import Collection, Sortie, record_name
+from models.design import design_to_json
+from models.record import vehicle_to_toml
+from sim_bridge.in_process import Flown, Plan, record
+from sim_bridge.truth.battery import BatteryState
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One flight of a collection: `number` from 1, the `sortie`, and the `plan` that flies it."""
+
+    number: int
+    sortie: Sortie
+    plan: Plan
+
+    @property
+    def name(self) -> str:
+        """File name of its record."""
+        return record_name(self.number, self.sortie)
+
+
+def flights(sorties: Sequence[Sortie], plan: Plan) -> list[Flight]:
+    """The sorties as `plan` flies them: same vehicle, design, truth and model; own battery charge and own noise."""
+    return [
+        Flight(
+            number,
+            sortie,
+            replace(
+                plan,
+                trajectory=sortie.path,
+                # Far apart, so that two collections of neighbouring seeds share no noise.
+                seed=1_000_003 * (plan.seed + 1) + number,
+                battery=BatteryState(sortie.charge, plan.battery.age),
+            ),
+        )
+        for number, sortie in enumerate(sorties, 1)
+    ]
+
+
+def fingerprint(plan: Plan) -> str:
+    """A hash of all that the records of a collection depend on beside seed and missions."""
+    told = (
+        vehicle_to_toml(plan.vehicle),
+        design_to_json(plan.design),
+        repr((plan.hidden, plan.noise, plan.rate, plan.battery.age)),
+    )
+    return hashlib.sha256("\n".join(told).encode() + (plan.model or b"")).hexdigest()[:16]
+
+
+def collect(
+    wanted: Sequence[Flight], collection: Collection, jobs: int
+) -> Iterator[tuple[Flight, dict[str, Any]]]:
+    """Fly what the collection lacks, in `jobs` processes; yields each flight with its entry once its record is whole.
+
+    A record depends on its flight alone: not on `jobs`, the order of ending, or earlier interruptions. When the
+    generator is closed or interrupted, flights under way are finished and kept, and the rest is not begun.
+    """
+    missing = [flight for flight in wanted if flight.name not in collection.flown]
+    if jobs <= 1 or len(missing) <= 1:
+        for flight in missing:
+            yield flight, _kept(collection, flight, _fly(flight, collection.folder))
+        return
+    # A fresh interpreter each: forking a process that has threads (the progress bar's) may hang.
+    pool = ProcessPoolExecutor(min(jobs, len(missing)), get_context("spawn"), _leave_interrupts_to_parent)
+    under_way = {pool.submit(_fly, flight, collection.folder): flight for flight in missing}
+    try:
+        for done in as_completed(list(under_way)):
+            flight = under_way.pop(done)
+            yield flight, _kept(collection, flight, done.result())
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        for late, flight in under_way.items():
+            if late.done() and not late.cancelled() and late.exception() is None:
+                _kept(collection, flight, late.result())
+
+
+def _leave_interrupts_to_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _fly(flight: Flight, folder: Path) -> Flown:
+    """Fly one into its record, which has its name only when it is whole."""
+    partial = folder / f".{flight.name}.part"
+    partial.unlink(missing_ok=True)
+    try:
+        flown = record(flight.plan, partial)
+        partial.replace(folder / flight.name)
+    finally:
+        partial.unlink(missing_ok=True)
+    return flown
+
+
+def _kept(collection: Collection, flight: Flight, flown: Flown) -> dict[str, Any]:
+    entry = {
+        "trajectory": flight.sortie.trajectory,
+        "parameters": flight.sortie.parameters,
+        "charge": flight.sortie.charge,
+        "outcome": flown.outcome,
+        "seconds": flown.simulated,
+        "ticks": flown.ticks,
+        "ticks_on_ground": flown.touching,
+        "rms_error": list(flown.rms_error),
+    }
+    collection.add(flight.name, entry)
+    return entry
