@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from groundstation import analysis_commands, flight_commands, pilot_commands
+from groundstation import analysis_commands, collect_commands, flight_commands, pilot_commands
 from models.errors import run_command_line
 
 app = typer.Typer(
@@ -20,6 +20,7 @@ app = typer.Typer(
 flight_commands.register(app)
 analysis_commands.register(app)
 pilot_commands.register(app)
+collect_commands.register(app)
 
 
 def main() -> None:

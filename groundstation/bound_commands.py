@@ -1,0 +1,167 @@
+"""Command line of the stability bound: the tube that a flight must stay in."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from groundstation.analysis_commands import print_json
+
+if TYPE_CHECKING:
+    from groundstation.bound import Tube
+
+console = Console()
+
+
+class AroundWhat(StrEnum):
+    """What the tube stands around."""
+
+    design = "design"
+    reference = "reference"
+
+
+MOST_LEAVINGS = 8
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the ground station's application."""
+    app.command(
+        "bound", epilog="Example: groundstation bound flight.mcap --from earlier.mcap --save tube.rrd"
+    )(bound_command)
+
+
+def bound_command(
+    flight: Annotated[Path, typer.Argument(help="A flight with its reference: record, table or ULog.")],
+    bound_from: Annotated[
+        Path | None,
+        typer.Option("--from", help="Take the bound on d from this flight: the honest test of a prediction."),
+    ] = None,
+    design: Annotated[
+        Path | None, typer.Option("--design", help="Design file; default: that of the record.")
+    ] = None,
+    vehicle: Annotated[
+        Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
+    ] = None,
+    around: Annotated[
+        AroundWhat,
+        typer.Option("--around", help="Middle of the tube: the linear design's flight, or the reference."),
+    ] = AroundWhat.design,
+    bandwidth: Annotated[
+        float | None,
+        typer.Option("--bandwidth", help="Low-pass on d, Hz; default: 20, 5 without IMU.", min=0.1),
+    ] = None,
+    rrd: Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """The tube that a flight must stay in, and whether it did: the paper's stability bound in Lyapunov's form.
+
+    d is by how much the acceleration differs from what the linear design has. As long as |d| keeps below its bound,
+    the error decays into a ball around the linear design's own flight (or around the reference) and stays there.
+    """
+    from groundstation.bound import predict_tube
+    from groundstation.tracking import read_designed
+
+    flown, believed, label = read_designed(flight, design, vehicle)
+    source = None if bound_from is None else read_designed(bound_from, design, vehicle)[0]
+    tube = predict_tube(flown, believed, label, around.value, source, bandwidth)
+    if rrd is not None:
+        from groundstation.views import write_tube
+
+        write_tube(rrd, tube)
+    if as_json:
+        print_json(_table(tube))
+        return
+    _print(tube)
+    if rrd is not None:
+        console.print(f"Rerun recording: {escape(str(rrd))}")
+
+
+def _print(tube: Tube) -> None:
+    from rich.table import Table
+
+    d = tube.disturbance
+    beyond = "that of the linear design" if d.around == "design" else "what the position loop asks for"
+    table = Table(title=f"{escape(tube.label)}: largest acceleration d beyond {beyond} (m/s²)")
+    for heading in ("axis", "d", "of the model", "of the attitude", "bound = radius"):
+        table.add_column(heading, justify="left" if heading == "axis" else "right")
+    largest = [abs(part).max(axis=0) for part in (d.total, d.model, d.attitude)]
+    for k, axis in enumerate("xyz"):
+        table.add_row(axis, *(f"{part[k]:.2f}" for part in largest), f"{tube.bound[k]:.2f}")
+    console.print(table)
+    table = Table(title=f"the tube around the {d.around}, world axes")
+    for heading in ("axis", "decay", "position", "flown", "velocity", "flown ", "inside"):
+        table.add_column(heading, justify="left" if heading == "axis" else "right")
+    most, ball, inside = abs(tube.distance).max(axis=0), tube.ball, tube.inside
+    for k, axis in enumerate("xyz"):
+        table.add_row(
+            axis,
+            f"{tube.balls[k].decay:.2f} 1/s",
+            f"± {ball[k, 0]:.2f} m",
+            f"{most[k, 0]:.2f} m",
+            f"± {ball[k, 1]:.2f} m/s",
+            f"{most[k, 1]:.2f} m/s",
+            f"{100 * inside[k]:.1f} %",
+        )
+    console.print(table)
+    console.print(
+        f"bound: the largest |d| of {escape(tube.bound_from)} below {d.bandwidth:g} Hz "
+        f"(sensor noise leaves {d.noise.max():.2f} m/s² RMS in it)",
+        highlight=False,
+    )
+    if len(tube.jumps):
+        console.print(
+            f"the reference jumps {len(tube.jumps)} times: the tube widens there by as much", highlight=False
+        )
+    for leaving in tube.leavings[:MOST_LEAVINGS]:
+        console.print(
+            f"[yellow]leaves the tube[/yellow] in {leaving.axis} at t = {leaving.start:.2f} s, for "
+            f"{leaving.end - leaving.start:.2f} s: V^(1/2) {leaving.level:.2f} m/s², allowed {leaving.allowed:.2f}",
+            highlight=False,
+        )
+    if len(tube.leavings) > MOST_LEAVINGS:
+        console.print(f"and {len(tube.leavings) - MOST_LEAVINGS} times more", highlight=False)
+    if not tube.leavings:
+        console.print("the flight never leaves the tube")
+
+
+def _table(tube: Tube) -> dict[str, Any]:
+    d = tube.disturbance
+    most, inside = abs(tube.distance).max(axis=0), tube.inside
+    return {
+        "flight": tube.flight.origin,
+        "label": tube.label,
+        "seconds": round(len(tube.t) * tube.flight.dt, 2),
+        "around": d.around,
+        "bound_from": tube.bound_from,
+        "bandwidth": d.bandwidth,
+        "noise_rms": d.noise.tolist(),
+        "axes": {
+            axis: {
+                "P": tube.balls[k].P.tolist(),
+                "decay": tube.balls[k].decay,
+                "bound": float(tube.bound[k]),
+                "radius": float(tube.bound[k]),
+                "ball_position": float(tube.ball[k, 0]),
+                "ball_velocity": float(tube.ball[k, 1]),
+                "d": float(abs(d.total[:, k]).max()),
+                "d_model": float(abs(d.model[:, k]).max()),
+                "d_attitude": float(abs(d.attitude[:, k]).max()),
+                "flown_position": float(most[k, 0]),
+                "flown_velocity": float(most[k, 1]),
+                "flown_level": float(tube.level[:, k].max()),
+                "inside": float(inside[k]),
+            }
+            for k, axis in enumerate("xyz")
+        },
+        "units": {"decay": "1/s", "bound": "m/s^2", "radius": "m/s^2", "position": "m", "velocity": "m/s"},
+        "jumps": tube.jumps.tolist(),
+        "leavings": [
+            {"axis": w.axis, "start": w.start, "end": w.end, "level": w.level, "allowed": w.allowed}
+            for w in tube.leavings
+        ],
+    }
