@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-from models.design import Design
+from models.design import Design, Matrix
 from models.trajectory import ReferenceSample
 from models.vehicle import GRAVITY, Vehicle
 
@@ -28,7 +28,8 @@ class State(NamedTuple):
     """What the loop needs to know of the vehicle.
 
     Position (m) and velocity (m/s) in the world from any origin that the reference shares, attitude as w, x,
-    y, z body to world, height above ground in m, battery voltage in V (0 where unknown).
+    y, z body to world, height above ground in m, battery voltage in V (0 where unknown), body rates in rad/s and
+    the accelerometer's specific force in m/s², both body axes (None where unknown).
     """
 
     position: Vector
@@ -36,6 +37,8 @@ class State(NamedTuple):
     quaternion: tuple[float, float, float, float]
     height: float
     battery_voltage: float
+    angular_velocity: Vector = ZERO
+    specific_force: Vector | None = None
 
 
 class Attitude(NamedTuple):
@@ -64,26 +67,12 @@ class Limits:
     thrust_high: float = 2.2
 
 
-class Corrector(Protocol):
-    """What stands between a learned model and the command: `companion.guard.Guard`."""
-
-    wants_yaw: bool
-
-    @property
-    def applied(self) -> Vector:
-        """The correction of the previous tick, as applied, m/s², heading frame."""
-        ...
-
-    def step(self, features: list[float], dt: float) -> tuple[Vector, Vector]:
-        """Error acceleration to cancel (m/s², heading frame): as applied, and as the model returned it."""
-        ...
-
-
 class ControlStep(NamedTuple):
     """One tick of the law: what the cascade alone would do, the correction, and what goes out.
 
     `thrust_command` is the normalised collective (0 to 1) of `command.thrust`. `correction` and
-    `correction_raw` are error accelerations in m/s², heading frame, after and before the guard.
+    `correction_raw` are error accelerations in m/s², heading frame: all that was applied, and what the live model
+    returned. `trim` is the part of the correction that comes from the trim, not from a model.
     """
 
     feedback: Command
@@ -91,6 +80,7 @@ class ControlStep(NamedTuple):
     correction_raw: Vector
     command: Command
     thrust_command: float
+    trim: Vector = ZERO
 
 
 IDLE_STEP = ControlStep(Command(0.0, ZERO), ZERO, ZERO, Command(0.0, ZERO), 0.0)
@@ -108,7 +98,9 @@ def euler(quaternion: tuple[float, float, float, float]) -> Vector:
     )
 
 
-def features(state: State, yaw: float, attitude: Attitude, voltage: float, wants_yaw: bool) -> list[float]:
+def features(
+    state: State, yaw: float, attitude: Attitude, voltage: float, wants_yaw: bool = False
+) -> list[float]:
     """Features (28) of the paper at the control `attitude`, in the order of `models.contract.FEATURES`."""
     c, s = math.cos(yaw), math.sin(yaw)
     vx, vy, vz = state.velocity
@@ -132,14 +124,15 @@ def features(state: State, yaw: float, attitude: Attitude, voltage: float, wants
 class ControlLaw:
     """The cascade for one vehicle and one design, with or without a correction.
 
-    It holds no state of its own: whatever changes from tick to tick is in `State`, the reference or the
-    corrector. Raises `InputError` where the design belongs to another vehicle.
+    It holds no state of its own: what changes from tick to tick is in `companion.controllers`. Raises
+    `InputError` where the design belongs to another vehicle.
     """
 
     def __init__(self, vehicle: Vehicle, design: Design, limits: Limits | None = None) -> None:
         design.check(vehicle)
         self.vehicle = vehicle
         self.limits = limits if limits is not None else Limits()
+        self.design = design
         self._k_eta = design.K_eta
         self._k_zeta = design.K_zeta
         self._weight = vehicle.weight
@@ -148,8 +141,18 @@ class ControlLaw:
         full = 0.95 * float(vehicle.thrust(1.0))  # type: ignore[arg-type]
         self._thrust_high = min(self.limits.thrust_high * vehicle.weight, full)
 
-    def feedback(self, state: State, yaw: float, reference: ReferenceSample) -> Attitude:
-        """Position loop: roll, pitch and thrust that the linear design asks for, within the limits."""
+    def feedback(
+        self,
+        state: State,
+        yaw: float,
+        reference: ReferenceSample,
+        gains: Matrix | None = None,
+        more: Vector = ZERO,
+    ) -> Attitude:
+        """Position loop: roll, pitch and thrust that the linear design asks for, within the limits.
+
+        `gains` (3, 6) replace `K_eta`; `more` (rad, rad, N) is added to what they give.
+        """
         c, s = math.cos(yaw), math.sin(yaw)
         (px, py, pz), (rx, ry, rz) = state.position, reference.position
         (vx, vy, vz), (wx, wy, wz) = state.velocity, reference.velocity
@@ -158,7 +161,7 @@ class ControlLaw:
         dx, dy = vx - wx, vy - wy
         x, y, z = c * ex + s * ey, c * ey - s * ex, pz - rz
         u, v, w = c * dx + s * dy, c * dy - s * dx, vz - wz
-        k = self._k_eta
+        k = gains if gains is not None else self._k_eta
         a, b, d = k[0], k[1], k[2]
         roll = -(a[0] * x + a[1] * y + a[2] * z + a[3] * u + a[4] * v + a[5] * w)
         pitch = -(b[0] * x + b[1] * y + b[2] * z + b[3] * u + b[4] * v + b[5] * w)
@@ -166,11 +169,13 @@ class ControlLaw:
         # inv(A_zeta): pitch forward accelerates along x, roll accelerates against y.
         roll -= (c * ay - s * ax) / GRAVITY
         pitch += (c * ax + s * ay) / GRAVITY
-        return self._limited(roll, pitch, self._weight + thrust + self.vehicle.mass * az)
+        return self.limited(
+            roll + more[0], pitch + more[1], self._weight + thrust + self.vehicle.mass * az + more[2]
+        )
 
     def corrected(self, attitude: Attitude, delta: Vector) -> Attitude:
         """(22): `u* - inv(A_zeta) delta` with `delta` in m/s², heading frame, within the limits."""
-        return self._limited(
+        return self.limited(
             attitude.roll + delta[1] / GRAVITY,
             attitude.pitch - delta[0] / GRAVITY,
             attitude.thrust - self.vehicle.mass * delta[2],
@@ -178,18 +183,28 @@ class ControlLaw:
 
     def command(self, zeta: Vector, attitude: Attitude, yaw_reference: float) -> Command:
         """Attitude loop: body rates that take roll, pitch, yaw `zeta` (rad) to the ones asked for."""
-        roll, pitch, yaw = zeta
-        ex, ey = roll - attitude.roll, pitch - attitude.pitch
-        ez = (yaw - yaw_reference + math.pi) % (2.0 * math.pi) - math.pi
+        return self.turning(zeta, self.euler_rates(zeta, attitude, yaw_reference), attitude.thrust)
+
+    def euler_rates(self, zeta: Vector, attitude: Attitude, yaw_reference: float) -> Vector:
+        """(13): rates of roll, pitch and yaw (rad/s) that take `zeta` (rad) to the attitude asked for."""
+        ex, ey = zeta[0] - attitude.roll, zeta[1] - attitude.pitch
+        ez = (zeta[2] - yaw_reference + math.pi) % (2.0 * math.pi) - math.pi
         a, b, d = self._k_zeta
-        rate_x = -(a[0] * ex + a[1] * ey + a[2] * ez)
-        rate_y = -(b[0] * ex + b[1] * ey + b[2] * ez)
-        rate_z = -(d[0] * ex + d[1] * ey + d[2] * ez)
+        return (
+            -(a[0] * ex + a[1] * ey + a[2] * ez),
+            -(b[0] * ex + b[1] * ey + b[2] * ez),
+            -(d[0] * ex + d[1] * ey + d[2] * ez),
+        )
+
+    def turning(self, zeta: Vector, rates: Vector, thrust: float) -> Command:
+        """Thrust (N) and the body rates that give these rates of roll, pitch, yaw (rad/s) at `zeta`, limited."""
+        roll, pitch, _ = zeta
+        rate_x, rate_y, rate_z = rates
         sr, cr = math.sin(roll), math.cos(roll)
         sp, cp = math.sin(pitch), math.cos(pitch)
         limit, yaw_limit = self.limits.body_rate, self.limits.yaw_rate
         return Command(
-            attitude.thrust,
+            thrust,
             (
                 _clip(rate_x - sp * rate_z, limit),
                 _clip(cr * rate_y + sr * cp * rate_z, limit),
@@ -197,29 +212,25 @@ class ControlLaw:
             ),
         )
 
-    def step(
-        self, state: State, reference: ReferenceSample, dt: float = 0.0, corrector: Corrector | None = None
-    ) -> ControlStep:
-        """One tick. `dt` (s) is the time since the previous one, which only the corrector needs."""
+    def step(self, state: State, reference: ReferenceSample) -> ControlStep:
+        """One tick of the cascade alone."""
         zeta = euler(state.quaternion)
-        attitude = self.feedback(state, zeta[2], reference)
-        plain = self.command(zeta, attitude, reference.yaw)
-        if corrector is None:
-            return ControlStep(plain, ZERO, ZERO, plain, self.normalised(plain.thrust))
-        voltage = state.battery_voltage if state.battery_voltage > 0.0 else self.vehicle.nominal_voltage
-        # (22) solves for u with delta at u*, which is off by delta's own dependence on u (thrust that is 10 % short
-        # asks for 10 % too much tilt). Evaluating at u* minus the previous correction is the fixed point of that
-        # equation, approached by one step a tick, at the price of none.
-        expected = self.corrected(attitude, corrector.applied)
-        applied, raw = corrector.step(features(state, zeta[2], expected, voltage, corrector.wants_yaw), dt)
-        command = self.command(zeta, self.corrected(attitude, applied), reference.yaw)
-        return ControlStep(plain, applied, raw, command, self.normalised(command.thrust))
+        plain = self.command(zeta, self.feedback(state, zeta[2], reference), reference.yaw)
+        return ControlStep(plain, ZERO, ZERO, plain, self.normalised(plain.thrust))
+
+    def at_limit(self, attitude: Attitude) -> bool:
+        """Whether the limits leave no more of tilt or thrust than this."""
+        return (
+            math.hypot(attitude.roll, attitude.pitch) >= 0.999 * self.limits.tilt
+            or not self._thrust_low < attitude.thrust < self._thrust_high
+        )
 
     def normalised(self, thrust: float) -> float:
         """Normalised collective command (0 to 1) believed to give `thrust` in N."""
         return min(1.0, max(0.0, self.vehicle.command(thrust)))
 
-    def _limited(self, roll: float, pitch: float, thrust: float) -> Attitude:
+    def limited(self, roll: float, pitch: float, thrust: float) -> Attitude:
+        """Roll and pitch (rad) within the tilt limit, thrust (N) within what the vehicle should give."""
         tilt = math.hypot(roll, pitch)
         if tilt > self.limits.tilt:  # keep the direction: a clipped axis would push the vehicle off its line
             roll, pitch = roll * self.limits.tilt / tilt, pitch * self.limits.tilt / tilt

@@ -38,6 +38,16 @@ KEY_GOLDEN_FEATURES = "golden_features"  # [[F floats] x at least 3]
 KEY_GOLDEN_DELTA = (
     "golden_delta"  # [[3 floats] x as many]; the companion evaluates them again, within GOLDEN_TOLERANCE
 )
+KEY_ACTUATION = "actuation"
+"""Optional: what was measured of the path from command to motion, {name: value} of `ACTUATION_LIMITS`."""
+ACTUATION_LIMITS: dict[str, float] = {
+    "rate_delay": 0.1,  # s, of the roll and pitch rate loop
+    "rate_lag": 0.15,  # s
+    "rate_integral": 20.0,  # 1/s, ratio of the rate loop's integral to its proportional gain
+    "thrust_delay": 0.1,  # s
+    "thrust_lag": 0.15,  # s
+}
+"""The greatest value of each number; beyond it no look-ahead can help, and none is accepted."""
 REQUIRED_KEYS = (
     KEY_CONTRACT,
     KEY_NAME,

@@ -1,0 +1,363 @@
+"""The controllers that a mission can choose: each turns a state and the reference ahead into one command a tick.
+
+* `lqr`: the linear cascade alone.
+* `lqr_integral`: the cascade with an integral in the position loop, the paper's third controller.
+* `corrected`: the cascade with the learned correction (22), the inverse of the known actuation, and a slow trim.
+
+The correction has to arrive as an acceleration, so what lies between command and acceleration is undone where
+it is known. Thrust acts after the motors' delay and lag, tilt in addition only through the attitude loop. So the
+cascade is evaluated for the moment at which its command will act, the rate loop's lag is inverted, and the
+attitude asked for the correction c is led by the attitude loop itself: `zeta_ref = u* + c + c_dot / K_zeta` makes
+`zeta - c` follow `u*` as the linear design does. The model is asked at the attitude that the vehicle will have,
+which is what it was fitted to, not at the one asked for; that also leaves no equation to be solved for u.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from companion.actuation import Actuation, LagInverse, RateModel
+from companion.behaviour import LinearBehaviour
+from companion.control import (
+    ZERO,
+    Attitude,
+    ControlLaw,
+    ControlStep,
+    State,
+    Vector,
+    euler,
+    features,
+)
+from companion.guard import Correction
+from models.errors import InputError
+from models.trajectory import ReferenceSample
+from models.vehicle import GRAVITY
+
+LQR, LQR_INTEGRAL, CORRECTED = "lqr", "lqr_integral", "corrected"
+CONTROLLERS = (LQR, LQR_INTEGRAL, CORRECTED)
+
+Preview = Callable[[float], ReferenceSample]
+"""The reference so many seconds from now; it holds still after its end."""
+
+_AHEAD = 0.02
+"""s over which the correction's rate of change is taken, where no lag asks for more."""
+_LONGEST_STEP = 0.1  # s of integration and fading in one tick, so that a gap in the odometry gives no jump
+_INTEGRAL_AUTHORITY = 3.0  # m/s², the most that the integral of `lqr_integral` may ask for per axis
+
+
+class Corrector(Protocol):
+    """What stands between learned models and the command: `companion.guard.Guard`."""
+
+    wants_yaw: bool
+
+    @property
+    def applied(self) -> Vector:
+        """The correction of the previous tick, as applied, m/s², heading frame."""
+        ...
+
+    @property
+    def engaged(self) -> float:
+        """Share, 0 to 1, to which models act now."""
+        ...
+
+    @property
+    def actuation(self) -> Actuation:
+        """What is known of the path from command to motion."""
+        ...
+
+    def step(self, rows: Sequence[list[float]], ahead: float, dt: float) -> Correction:
+        """The correction for three rows of features: when tilt acts, `ahead` s later, and when thrust acts."""
+        ...
+
+
+class Controller(Protocol):
+    """One controller during one flight; it belongs to the control thread."""
+
+    def step(self, state: State, preview: Preview, dt: float) -> ControlStep:
+        """One tick; `dt` s since the previous one."""
+        ...
+
+    def start(self) -> None:
+        """The mission's trajectory begins with the next tick."""
+        ...
+
+    def stop(self) -> None:
+        """The mission's trajectory is over."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrimLimits:
+    """The slow trim of `corrected`: it removes what is left between the flight and its linear behaviour.
+
+    The integral of the distance to the expected linear behaviour, with `bandwidth` (rad/s, in relation to the
+    position loop's stiffness) and an `authority` in m/s² per axis; `bandwidth` 0 switches it off.
+    """
+
+    bandwidth: float = 0.25
+    authority: float = 1.0
+
+
+def make_controller(
+    name: str,
+    law: ControlLaw,
+    corrector: Corrector | None = None,
+    trim: TrimLimits | None = None,
+) -> Controller:
+    """The controller of this name; raises `InputError` for an unknown one or one that lacks what it needs."""
+    if name == LQR:
+        return Lqr(law)
+    if name == LQR_INTEGRAL:
+        return LqrIntegral(law)
+    if name != CORRECTED:
+        raise InputError(f"controller '{name}' is unknown; use one of {', '.join(CONTROLLERS)}")
+    if corrector is None:
+        raise InputError("controller 'corrected' needs a deployed model")
+    return Corrected(law, corrector, trim or TrimLimits())
+
+
+class Lqr:
+    """The linear cascade alone."""
+
+    def __init__(self, law: ControlLaw) -> None:
+        self._law = law
+
+    def start(self) -> None:
+        """Nothing: it has no memory."""
+
+    def stop(self) -> None:
+        """Nothing: it has no memory."""
+
+    def step(self, state: State, preview: Preview, dt: float) -> ControlStep:
+        """One tick of the cascade."""
+        return self._law.step(state, preview(0.0))
+
+
+class LqrIntegral:
+    """The cascade with an integral of the position error in the position loop."""
+
+    def __init__(self, law: ControlLaw) -> None:
+        gains = law.design.integral
+        if gains is None:
+            raise InputError(
+                f"design of '{law.design.vehicle}': it has no gains for lqr_integral; "
+                "run `groundstation design` again"
+            )
+        self._law, self._gains = law, gains
+        self._integral = ZERO  # m s, world
+        mass = law.vehicle.mass
+        per_axis = (GRAVITY * abs(gains.K_i[1][0]), GRAVITY * abs(gains.K_i[0][1]), gains.K_i[2][2] / mass)
+        self._most = [_INTEGRAL_AUTHORITY / k if k > 0.0 else 0.0 for k in per_axis]
+
+    def start(self) -> None:
+        """Keep the integral: what it has learned in the climb still holds."""
+
+    def stop(self) -> None:
+        """Keep the integral."""
+
+    def step(self, state: State, preview: Preview, dt: float) -> ControlStep:
+        """One tick; the integral does not grow while tilt or thrust are at their limits."""
+        law, k = self._law, self._gains.K_i
+        reference = preview(0.0)
+        zeta = euler(state.quaternion)
+        c, s = math.cos(zeta[2]), math.sin(zeta[2])
+        dt = min(_LONGEST_STEP, max(0.0, dt))
+        grown = tuple(
+            min(most, max(-most, i + dt * (p - r)))
+            for i, p, r, most in zip(
+                self._integral, state.position, reference.position, self._most, strict=True
+            )
+        )
+        x, y, z = c * grown[0] + s * grown[1], c * grown[1] - s * grown[0], grown[2]
+        more = (
+            -(k[0][0] * x + k[0][1] * y + k[0][2] * z),
+            -(k[1][0] * x + k[1][1] * y + k[1][2] * z),
+            -(k[2][0] * x + k[2][1] * y + k[2][2] * z),
+        )
+        attitude = law.feedback(state, zeta[2], reference, self._gains.K_eta, more)
+        if not law.at_limit(attitude):
+            self._integral = (grown[0], grown[1], grown[2])
+        command = law.command(zeta, attitude, reference.yaw)
+        return ControlStep(command, ZERO, ZERO, command, law.normalised(command.thrust))
+
+
+class Corrected:
+    """The cascade with the learned correction, the inverse of the actuation, and the trim.
+
+    All three fade with the corrector's `engaged`: with nothing engaged it is the cascade, tick for tick.
+    """
+
+    def __init__(self, law: ControlLaw, corrector: Corrector, limits: TrimLimits) -> None:
+        self._law, self._corrector, self._limits = law, corrector, limits
+        k_eta, k_zeta = law.design.K_eta, law.design.K_zeta
+        self._tilt_gain = 0.5 * (k_zeta[0][0] + k_zeta[1][1])
+        stiffness = (GRAVITY * k_eta[1][0], -GRAVITY * k_eta[0][1], k_eta[2][2] / law.vehicle.mass)
+        self._trim_gain = [limits.bandwidth * k for k in stiffness]
+        self._running = False
+        self._behaviour: LinearBehaviour | None = None
+        self._trim = ZERO  # m/s², world
+        self._share = 0.0
+        self._command = ZERO
+        self._rates, self._inverse = RateModel(corrector.actuation), LagInverse()
+
+    def start(self) -> None:
+        """Expect the linear behaviour from the next tick's state on."""
+        self._running, self._behaviour = True, None
+
+    def stop(self) -> None:
+        """Expect nothing any more; the trim stays as it is until the correction has faded out."""
+        self._running, self._behaviour = False, None
+
+    def step(self, state: State, preview: Preview, dt: float) -> ControlStep:
+        """One tick."""
+        law, corrector = self._law, self._corrector
+        zeta = euler(state.quaternion)
+        yaw = zeta[2]
+        now = preview(0.0)
+        plain = law.command(zeta, law.feedback(state, yaw, now), now.yaw)
+        self._rates.actuation = actuation = corrector.actuation
+        self._rates.advance(self._command[:2], dt)
+        share = self._faded(corrector.engaged, dt)
+        trim = self._trimmed(state, zeta, now, share, dt)
+        if share == 0.0 and not self._running and corrector.applied == ZERO:
+            self._inverse.reset()
+            self._command = plain.body_rate
+            return ControlStep(plain, ZERO, ZERO, plain, law.normalised(plain.thrust))
+
+        known = actuation.scaled(share)
+        (turned_x, turned_y), (more_p, more_q) = self._rates.on_its_way(share)
+        p, q, r = state.angular_velocity
+        rates = _euler_rates(zeta, (p + more_p, q + more_q, r))
+        turned = _euler_rates(zeta, (turned_x, turned_y, 0.0))
+        tilted = (zeta[0] + turned[0], zeta[1] + turned[1], yaw)
+
+        # Three moments: when a rate commanded now acts, a little later, and when a thrust commanded now acts.
+        ahead = max(known.rate_lag, _AHEAD)
+        lift = known.thrust_delay + known.thrust_lag
+        acceleration = _acceleration(state)
+        early = _after(state, acceleration, known.rate_delay)
+        late = _after(state, acceleration, known.rate_delay + ahead)
+        lifted = _after(state, acceleration, lift)
+        reference = preview(known.rate_delay)
+        tilt = law.feedback(early, yaw, reference)
+        tilt_late = law.feedback(late, yaw, preview(known.rate_delay + ahead))
+        thrust = law.feedback(lifted, yaw, preview(lift)).thrust
+
+        before = corrector.applied
+        asked = law.corrected(Attitude(0.0, 0.0, thrust), (0.0, 0.0, before[2] + trim[2])).thrust
+        voltage = state.battery_voltage if state.battery_voltage > 0.0 else law.vehicle.nominal_voltage
+        rows = [
+            features(early, yaw, Attitude(tilted[0], tilted[1], asked), voltage, corrector.wants_yaw),
+            features(
+                late,
+                yaw,
+                Attitude(tilted[0] + ahead * rates[0], tilted[1] + ahead * rates[1], asked),
+                voltage,
+                corrector.wants_yaw,
+            ),
+            features(
+                lifted,
+                yaw,
+                Attitude(zeta[0] + lift * rates[0], zeta[1] + lift * rates[1], asked),
+                voltage,
+                corrector.wants_yaw,
+            ),
+        ]
+        correction = corrector.step(rows, ahead, dt)
+        x, y, z = (a + t for a, t in zip(correction.applied, trim, strict=True))
+        # The attitude loop takes 1 / K to follow: lead the correction by that much.
+        led = (
+            x + share * correction.rate[0] / self._tilt_gain,
+            y + share * correction.rate[1] / self._tilt_gain,
+        )
+        lifted_thrust = law.corrected(Attitude(0.0, 0.0, thrust), (0.0, 0.0, z)).thrust
+        attitude = law.corrected(Attitude(tilt.roll, tilt.pitch, lifted_thrust), (led[0], led[1], 0.0))
+        later = law.corrected(
+            Attitude(tilt_late.roll, tilt_late.pitch, lifted_thrust),
+            (led[0] + ahead * correction.rate[0], led[1] + ahead * correction.rate[1], 0.0),
+        )
+        wanted = law.euler_rates(tilted, attitude, reference.yaw)
+        then = law.euler_rates(
+            (tilted[0] + ahead * rates[0], tilted[1] + ahead * rates[1], yaw), later, reference.yaw
+        )
+        slope = ((then[0] - wanted[0]) / ahead, (then[1] - wanted[1]) / ahead)
+        added = self._inverse.step(slope, known.rate_lag, known.rate_integral, dt)
+        command = law.turning(zeta, (wanted[0] + added[0], wanted[1] + added[1], wanted[2]), attitude.thrust)
+        self._command = command.body_rate
+        return ControlStep(plain, (x, y, z), correction.raw, command, law.normalised(command.thrust), trim)
+
+    def _faded(self, engaged: float, dt: float) -> float:
+        """The share of look-ahead and trim: follows what is engaged, at the pace of a fade at most."""
+        change = min(_LONGEST_STEP, max(0.0, dt))
+        self._share = min(self._share + change, max(self._share - change, engaged))
+        return self._share
+
+    def _trimmed(
+        self, state: State, zeta: Vector, reference: ReferenceSample, share: float, dt: float
+    ) -> Vector:
+        """The trim (m/s², heading frame) after this tick's distance to the linear behaviour."""
+        if self._running and self._limits.bandwidth > 0.0:
+            if self._behaviour is None:
+                self._behaviour = LinearBehaviour(
+                    self._law.design, state.position, state.velocity, zeta, reference
+                )
+            else:
+                self._behaviour.step(reference, dt)
+                self._grow(state.position, self._behaviour.position, zeta[2], share * min(_LONGEST_STEP, dt))
+        c, s = math.cos(zeta[2]), math.sin(zeta[2])
+        x, y, z = (share * t for t in self._trim)
+        return c * x + s * y, c * y - s * x, z
+
+    def _grow(self, position: Vector, expected: Vector, yaw: float, dt: float) -> None:
+        x, y, z = (p - e for p, e in zip(position, expected, strict=True))
+        c, s = math.cos(yaw), math.sin(yaw)
+        a, b, d = self._trim_gain
+        # Gains belong to the heading frame, the disturbance to the world.
+        along, across = dt * a * (c * x + s * y), dt * b * (c * y - s * x)
+        grown = (
+            self._trim[0] + c * along - s * across,
+            self._trim[1] + s * along + c * across,
+            self._trim[2] + dt * d * z,
+        )
+        most = self._limits.authority
+        u, v, w = (min(most, max(-most, g)) for g in grown)
+        self._trim = (u, v, w)
+
+
+def _acceleration(state: State) -> Vector:
+    """Acceleration in the world, m/s², as the accelerometer has it; none where there is no accelerometer."""
+    if state.specific_force is None:
+        return ZERO
+    w, x, y, z = state.quaternion
+    fx, fy, fz = state.specific_force
+    # R f = f + 2 q x (q x f + w f)
+    a, b, c = y * fz - z * fy + w * fx, z * fx - x * fz + w * fy, x * fy - y * fx + w * fz
+    return (
+        fx + 2.0 * (y * c - z * b),
+        fy + 2.0 * (z * a - x * c),
+        fz + 2.0 * (x * b - y * a) - GRAVITY,
+    )
+
+
+def _after(state: State, acceleration: Vector, h: float) -> State:
+    """The state `h` s later, at this acceleration; attitude as it is."""
+    (x, y, z), (u, v, w), (a, b, c) = state.position, state.velocity, acceleration
+    half = 0.5 * h * h
+    return state._replace(
+        position=(x + h * u + half * a, y + h * v + half * b, z + h * w + half * c),
+        velocity=(u + h * a, v + h * b, w + h * c),
+        height=state.height + h * w + half * c,
+    )
+
+
+def _euler_rates(zeta: Vector, body: Vector) -> Vector:
+    """Rates of roll, pitch, yaw of body rates (rad/s): Diebel 2006, equation 76."""
+    roll, pitch, _ = zeta
+    p, q, r = body
+    sr, cr = math.sin(roll), math.cos(roll)
+    cp = max(0.2, math.cos(pitch))
+    turning = (sr * q + cr * r) / cp
+    return p + math.sin(pitch) * turning, cr * q - sr * r, turning
