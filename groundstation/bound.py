@@ -4,9 +4,12 @@ Around its reference the vehicle obeys `eta' = (A - B K) eta + (0, d)`, with `d`
 from what the ideal position loop (16) asks for. The paper bounds `eta' (A - B K) eta` by the least eigenvalue, which
 does not hold for a matrix that is not symmetric. Instead, with `P` of a Lyapunov equation and `V = eta' P eta`,
 
-    V' <= -2 alpha (V - bound²)    wherever |d| <= bound,
+    V' <= -2 alpha (V - d²),    so    V(t) <= V(0) exp(-2 alpha t) + radius²,
 
-so `V` falls towards the ball `V <= bound²` and never leaves it again. `P` is the inverse of `X` from
+where radius² is the largest that the mean of d² gets when what is longer ago than t counts by exp(-2 alpha t): d over
+the loop's own memory of 1 / (2 alpha). V decays to the ball `V <= radius²` and never leaves it again, as long as d
+keeps its bounds; the radius is no greater than the largest |d|, and a short spike, or a sensor's noise, weighs as
+little in it as it moves the vehicle. `P` is the inverse of `X` from
 
     (A - B K + alpha I) X + X (A - B K + alpha I)' + B B' / (2 alpha) = 0
 
@@ -64,6 +67,9 @@ class Ball:
         return np.sqrt(np.einsum("...i,ij,...j->...", eta, self.P, eta))
 
 
+Balls = tuple[Ball, Ball, Ball]
+
+
 @dataclass(frozen=True)
 class Disturbance:
     """By what the acceleration of a flight differed from what its ideal position loop asked for, over the M samples of
@@ -72,22 +78,28 @@ class Disturbance:
     `total` (M, 3) m/s², world ENU, is the sum of `model` (delta - delta_hat: error of the hover model (10), less the
     correction as applied) and `attitude` (A_zeta times the attitude not yet reached, and commands at their limits); all
     behind the same zero-phase low-pass of `bandwidth` Hz; `noise` (3,) is the RMS that the accelerometer's noise leaves
-    in it, body axes. `bound` (3,) is the largest |total|.
+    in it, body axes. `stretches` are the slices of the M samples that one mission each has.
     """
 
     flight: Flight
     around: Around
     rows: np.ndarray
+    stretches: tuple[slice, ...]
     total: np.ndarray
     model: np.ndarray
     attitude: np.ndarray
     bandwidth: float
     noise: np.ndarray
 
-    @property
-    def bound(self) -> np.ndarray:
-        """Largest |d| per axis of the world, m/s²: a bound that holds, not a quantile."""
-        return np.max(np.abs(self.total), axis=0)
+    def radius(self, balls: Balls, part: Literal["total", "model", "attitude"] = "total") -> np.ndarray:
+        """Radius (3,) of the ball in m/s², per axis of the world, of d or of one part of it alone."""
+        values = getattr(self, part)
+        return np.array(
+            [
+                max(memory(values[rows, k], ball.decay, self.flight.dt).max() for rows in self.stretches)
+                for k, ball in enumerate(balls)
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -106,7 +118,8 @@ class Leaving:
 class Tube:
     """A flight in its predicted tube, over the M samples of its missions, axes x, y, z of the world.
 
-    `balls` one an axis; `bound` (3,) on |d| in m/s², of the flight `bound_from`; `disturbance` what really acted.
+    `balls` one an axis; `radius` (3,) and `bound` (3,) in m/s², of the mean of d over the loop's memory and of the
+    largest |d|, both of the flight `bound_from`; `disturbance` is what really acted.
     `eta` (M, 3, 2) is the position and velocity error (m, m/s) to the reference, `centre` (M, 3, 2) where in it the
     tube has its middle: zero around the reference; around the design, what the linear design itself leaves. `level`
     (M, 3) is V^(1/2) of their difference and `predicted` (M, 3) what the tube allows (m/s²). `jumps` are the times at
@@ -115,7 +128,8 @@ class Tube:
 
     flight: Flight
     label: str
-    balls: tuple[Ball, Ball, Ball]
+    balls: Balls
+    radius: np.ndarray
     bound: np.ndarray
     bound_from: str
     disturbance: Disturbance
@@ -149,10 +163,10 @@ class Tube:
     @property
     def ball(self) -> np.ndarray:
         """Half width (3, 2) of the tube once it has settled: position (m) and velocity (m/s)."""
-        return self.bound[:, None] * np.array([[ball.position, ball.velocity] for ball in self.balls])
+        return self.radius[:, None] * np.array([[ball.position, ball.velocity] for ball in self.balls])
 
 
-def balls_of(design: Design) -> tuple[Ball, Ball, Ball]:
+def balls_of(design: Design) -> Balls:
     """The balls of the axes x, y, z. Raises `InputError` where the gains couple the axes or tell x from y."""
     a_zeta = hover_input_matrix(design.mass)
     gains = a_zeta @ np.array(design.K_eta)
@@ -188,25 +202,34 @@ def smallest_ball(p: float, v: float) -> Ball:
     return Ball(np.linalg.inv(x), alpha, float(np.sqrt(x[0, 0])), float(np.sqrt(x[1, 1])))
 
 
-def tube(ball: Ball, bound: float, t: np.ndarray, start: float, jumps: np.ndarray) -> np.ndarray:
-    """What V^(1/2) (N,) may at most be at times `t` (N,) s under |d| <= `bound`, from `start` at the first.
+def memory(d: np.ndarray, decay: float, dt: float) -> np.ndarray:
+    """Square root of the fading mean (N,) of d² (N,) in m/s², the weight of what was falling by exp(-2 decay t)."""
+    from scipy import signal
 
-    `jumps` (N, 2) is by what the reference jumps at each sample (m, m/s). There eta jumps by as much, and V^(1/2), a
-    norm, by no more than the jump's own.
+    keep = np.exp(-2.0 * decay * dt)
+    return np.sqrt(signal.lfilter([1.0 - keep], [1.0, -keep], np.asarray(d) ** 2))
+
+
+def tube(
+    ball: Ball, radius: float, bound: float, t: np.ndarray, start: float, jumps: np.ndarray
+) -> np.ndarray:
+    """What V^(1/2) (N,) may at most be at times `t` (N,) s, from `start` at the first, in m/s².
+
+    As long as |d| <= `bound` and its fading mean (`memory`) stays below `radius`. `jumps` (N, 2) is by what the
+    reference jumps at each sample (m, m/s). There eta jumps by as much, and V^(1/2), a norm, by no more than the jump's
+    own.
     """
     size = ball.level(jumps)
     out = np.empty(len(t))
     edges = [0, *np.flatnonzero(size[1:] > 0.0) + 1, len(t)]
     level = start
     for begin, end in itertools.pairwise(edges):
-        out[begin:end] = _settled(level, bound, ball.decay, t[begin:end] - t[begin])
+        fading = np.exp(-2.0 * ball.decay * (t[begin : end + 1] - t[begin]))
+        allowed = np.sqrt(level**2 * fading + np.minimum(radius**2, bound**2 * (1.0 - fading)))
+        out[begin:end] = allowed[: end - begin]
         if end < len(t):
-            level = float(_settled(level, bound, ball.decay, t[end] - t[begin]) + size[end])
+            level = float(allowed[-1] + size[end])
     return out
-
-
-def _settled(level: float, bound: float, decay: float, after: np.ndarray) -> np.ndarray:
-    return np.sqrt(bound**2 + (level**2 - bound**2) * np.exp(-2.0 * decay * after))
 
 
 def jumps_of(t: np.ndarray, reference: Reference) -> np.ndarray:
@@ -260,7 +283,18 @@ def disturbance(
         total.append(_low_pass(whole, jumps, bandwidth, flight.dt))
         model.append(_low_pass(part, jumps, bandwidth, flight.dt))
     d, of_model = np.concatenate(total), np.concatenate(model)
-    return Disturbance(flight, around, np.concatenate(stretches), d, of_model, d - of_model, bandwidth, noise)
+    edges = np.cumsum([0, *(len(rows) for rows in stretches)]).tolist()
+    return Disturbance(
+        flight=flight,
+        around=around,
+        rows=np.concatenate(stretches),
+        stretches=tuple(slice(a, b) for a, b in itertools.pairwise(edges)),
+        total=d,
+        model=of_model,
+        attitude=d - of_model,
+        bandwidth=bandwidth,
+        noise=noise,
+    )
 
 
 def predict_tube(
@@ -279,7 +313,7 @@ def predict_tube(
     balls = balls_of(design)
     own = disturbance(flight, design, around, bandwidth)
     source = own if bound_from is None else disturbance(bound_from, design, around, bandwidth)
-    bound = source.bound
+    radius, bound = source.radius(balls), np.abs(source.total).max(axis=0)
     parts = []
     for rows in missions(flight):
         t, reference = flight.t[rows], reference_of(flight, rows)
@@ -290,7 +324,8 @@ def predict_tube(
             jumps = np.zeros_like(jumps)
         level = np.stack([ball.level((eta - centre)[:, k]) for k, ball in enumerate(balls)], -1)
         predicted = np.stack(
-            [tube(ball, bound[k], t, level[0, k], jumps[:, k]) for k, ball in enumerate(balls)], -1
+            [tube(ball, radius[k], bound[k], t, level[0, k], jumps[:, k]) for k, ball in enumerate(balls)],
+            -1,
         )
         jumped = t[np.any(jumps != 0.0, axis=(1, 2))]
         parts.append((t, reference.position, eta, centre, level, predicted, jumped, t[:1]))
@@ -301,6 +336,7 @@ def predict_tube(
         flight=flight,
         label=label or flight.name,
         balls=balls,
+        radius=radius,
         bound=bound,
         bound_from=source.flight.origin or source.flight.name,
         disturbance=own,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -26,6 +26,7 @@ class AroundWhat(StrEnum):
 
 
 MOST_LEAVINGS = 8
+PARTS: tuple[Literal["total", "model", "attitude"], ...] = ("total", "model", "attitude")
 
 
 def register(app: typer.Typer) -> None:
@@ -86,12 +87,12 @@ def _print(tube: Tube) -> None:
 
     d = tube.disturbance
     beyond = "that of the linear design" if d.around == "design" else "what the position loop asks for"
-    table = Table(title=f"{escape(tube.label)}: largest acceleration d beyond {beyond} (m/s²)")
-    for heading in ("axis", "d", "of the model", "of the attitude", "bound = radius"):
+    table = Table(title=f"{escape(tube.label)}: acceleration d beyond {beyond} (m/s²)")
+    for heading in ("axis", "largest |d|", "over memory", "model alone", "attitude alone", "radius of tube"):
         table.add_column(heading, justify="left" if heading == "axis" else "right")
-    largest = [abs(part).max(axis=0) for part in (d.total, d.model, d.attitude)]
+    parts = [abs(d.total).max(axis=0), *(d.radius(tube.balls, part) for part in PARTS), tube.radius]
     for k, axis in enumerate("xyz"):
-        table.add_row(axis, *(f"{part[k]:.2f}" for part in largest), f"{tube.bound[k]:.2f}")
+        table.add_row(axis, *(f"{part[k]:.2f}" for part in parts))
     console.print(table)
     table = Table(title=f"the tube around the {d.around}, world axes")
     for heading in ("axis", "decay", "position", "flown", "velocity", "flown ", "inside"):
@@ -105,12 +106,13 @@ def _print(tube: Tube) -> None:
             f"{most[k, 0]:.2f} m",
             f"± {ball[k, 1]:.2f} m/s",
             f"{most[k, 1]:.2f} m/s",
-            f"{100 * inside[k]:.1f} %",
+            f"{100 * inside[k]:.2f} %",
         )
     console.print(table)
+    memories = sorted({f"{0.5 / ball.decay:.1f}" for ball in tube.balls})
     console.print(
-        f"bound: the largest |d| of {escape(tube.bound_from)} below {d.bandwidth:g} Hz "
-        f"(sensor noise leaves {d.noise.max():.2f} m/s² RMS in it)",
+        f"radius: the most that d of {escape(tube.bound_from)} has as RMS over the loop's memory of "
+        f"{' to '.join(memories)} s, below {d.bandwidth:g} Hz (sensor noise: {d.noise.max():.2f})",
         highlight=False,
     )
     if len(tube.jumps):
@@ -132,6 +134,7 @@ def _print(tube: Tube) -> None:
 def _table(tube: Tube) -> dict[str, Any]:
     d = tube.disturbance
     most, inside = abs(tube.distance).max(axis=0), tube.inside
+    radii = {part: d.radius(tube.balls, part) for part in PARTS}
     return {
         "flight": tube.flight.origin,
         "label": tube.label,
@@ -145,12 +148,11 @@ def _table(tube: Tube) -> dict[str, Any]:
                 "P": tube.balls[k].P.tolist(),
                 "decay": tube.balls[k].decay,
                 "bound": float(tube.bound[k]),
-                "radius": float(tube.bound[k]),
+                "radius": float(tube.radius[k]),
                 "ball_position": float(tube.ball[k, 0]),
                 "ball_velocity": float(tube.ball[k, 1]),
                 "d": float(abs(d.total[:, k]).max()),
-                "d_model": float(abs(d.model[:, k]).max()),
-                "d_attitude": float(abs(d.attitude[:, k]).max()),
+                "d_over_memory": {part: float(radii[part][k]) for part in PARTS},
                 "flown_position": float(most[k, 0]),
                 "flown_velocity": float(most[k, 1]),
                 "flown_level": float(tube.level[:, k].max()),

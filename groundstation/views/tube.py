@@ -54,7 +54,7 @@ def _blueprint(stream: rr.RecordingStream, tube: Tube) -> rrb.Blueprint:
     text(stream, "summary", _summary(tube))
     space = rrb.Spatial3DView(
         origin="space",
-        name="flown (blue) and the ball around the reference (green)",
+        name=f"flown (blue) and the ball around the {tube.disturbance.around} (green)",
         eye_controls=scene.eye(tube.position, 1.1),
         line_grid=scene.ground(),
     )
@@ -145,13 +145,13 @@ def _log_space(stream: rr.RecordingStream, tube: Tube, clock: np.ndarray) -> Non
 def _summary(tube: Tube) -> str:
     ball, most, inside = tube.ball, np.abs(tube.distance).max(axis=0), tube.inside
     lines = [
-        "| axis | radius = bound on d (m/s²) | decay (1/s) | ball (cm) | flown | ball (cm/s) | flown | inside |",
+        "| axis | radius (m/s²) | decay (1/s) | ball (cm) | flown | ball (cm/s) | flown | inside |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for k, axis in enumerate("xyz"):
         lines.append(
-            f"| {axis} | {tube.bound[k]:.2f} | {tube.balls[k].decay:.2f} | ± {100 * ball[k, 0]:.1f} "
-            f"| {100 * most[k, 0]:.1f} | ± {100 * ball[k, 1]:.0f} | {100 * most[k, 1]:.0f} | {100 * inside[k]:.1f} % |"
+            f"| {axis} | {tube.radius[k]:.2f} | {tube.balls[k].decay:.2f} | ± {100 * ball[k, 0]:.1f} "
+            f"| {100 * most[k, 0]:.1f} | ± {100 * ball[k, 1]:.0f} | {100 * most[k, 1]:.0f} | {100 * inside[k]:.2f} % |"
         )
     lines += ["", f"Around the {tube.disturbance.around}; bound from {Path(tube.bound_from).name}."]
     if len(tube.jumps):
