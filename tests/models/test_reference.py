@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from models.errors import InputError
 from models.reference import KINDS, Trajectory, trajectory, trajectory_from_csv, transfer
 
-SMOOTH = sorted(name for name in KINDS if not name.startswith("step_"))
+SMOOTH = sorted(name for name in KINDS if not name.startswith("step") and name != "scenario")
 
 
 @pytest.mark.parametrize("name", sorted(KINDS))
@@ -186,3 +186,40 @@ def test_a_trajectory_holds_its_ends() -> None:
     assert path.at(-5.0).position == path.start[:3]
     assert path.at(path.duration + 5.0).position == pytest.approx(path.end[:3])
     assert path.at(path.duration + 5.0).velocity == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_scenario_steps_along_every_axis_and_translates_in_every_plane(seed: int) -> None:
+    path = trajectory("scenario", seed=seed)
+    assert 30.0 < path.duration < 45.0
+    t = np.arange(0.0, path.duration, 0.01)
+    c = path.sample(t)
+    jumps = np.diff(c.position, axis=0)
+    stepped = np.abs(jumps).max(axis=1) > 0.2  # smooth motion makes 0.02 m a sample at most
+    assert stepped.sum() == 6  # each axis, there and back
+    for axis in range(3):
+        sizes = np.abs(jumps[stepped, axis])
+        assert (sizes > 0.2).sum() == 2 and 0.5 <= sizes.max() <= 1.0
+    moving = np.linalg.norm(c.velocity, axis=1) > 0.3
+    assert np.all(np.abs(c.velocity).max(axis=0) > 0.5), "every axis is translated along"
+    assert 0.3 < moving.mean() < 0.8
+    assert path.max_speed <= 2.0 + 1e-9 and path.bounds[0][2] > 0.6
+
+
+def test_another_seed_is_another_scenario_and_the_same_seed_the_same() -> None:
+    t = np.arange(0.0, 30.0, 0.1)
+    one, again, other = (trajectory("scenario", seed=s).sample(t).position for s in (4, 4, 5))
+    assert np.array_equal(one, again)
+    assert not np.allclose(one, other)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_steps_go_everywhere_there_and_back_above_the_floor(seed: int) -> None:
+    path = trajectory("steps", seed=seed, size=1.5, height=1.0, count=26, time=1.0)
+    c = path.sample(np.arange(0.0, path.duration, 0.05))
+    away = c.position - np.array(path.start[:3])
+    directions = {tuple(np.sign(np.round(d, 6)).astype(int)) for d in away}
+    assert len(directions) > 16  # those that would end below the floor are mirrored
+    lengths = np.linalg.norm(away, axis=1)
+    assert lengths.max() <= 1.5 + 1e-9 and lengths[lengths > 0].min() >= 0.75 - 1e-9
+    assert c.position[:, 2].min() >= 0.3
