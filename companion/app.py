@@ -74,6 +74,7 @@ class Companion:
             store,
             settings.safety,
             settings.guard,
+            settings.shadow,
             records,
             settings.rate,
             self.emit,
@@ -84,8 +85,8 @@ class Companion:
             session,
             vehicle.name,
             {
-                "status": lambda payload: self.director.status(),
-                "mission": lambda payload: self.director.request(read_json(payload)),
+                "status": lambda payload, parameters: self.director.status(),
+                "mission": lambda payload, parameters: self.director.request(read_json(payload)),
                 "model": self._model,
             },
             records,
@@ -150,9 +151,13 @@ class Companion:
         if self._errors_told <= 5:
             self.emit("warning", "malformed_message", text)
 
-    def _model(self, payload: bytes) -> dict[str, Any]:
+    def _model(self, payload: bytes, parameters: dict[str, str]) -> dict[str, Any]:
         if payload[:1] != b"{":
-            return self.director.deploy(payload)
+            shadow = parameters.get("shadow")
+            try:
+                return self.director.deploy(payload, float(shadow) if shadow is not None else None)
+            except ValueError:
+                return {"accepted": False, "reason": f"shadow = {shadow!r} is not a number of seconds"}
         command = read_json(payload).get("command")
         if command == "list":
             return {"accepted": True, "reason": "", **self.director.store.describe()}

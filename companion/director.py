@@ -12,15 +12,18 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from companion.flight import IDLE, LANDING, SILENT, TAKEOFF, Flight, Mission, Safety
-from companion.guard import Guard, GuardLimits
+from companion.flight import IDLE, LANDING, SILENT, TAKEOFF, Decision, Flight, Mission, Safety
+from companion.guard import Guard
+from companion.inference import Model
+from companion.shadow import Shadow, ShadowLimits
 from companion.store import ModelStore
 from companion.vehicle_link import Rates, VehicleLink
+from companion.watch import GuardLimits, Watch
 from models.design import Design
 from models.errors import InputError
 from models.record import FlightRecorder
@@ -37,6 +40,7 @@ _STALLED, _GONE = (
     10.0,
 )  # s without a tick that are told, and without any sign of the vehicle that end a flight
 _RATE_SHARE = 0.75
+_SHADOW_SECONDS = (0.5, 600.0)
 _MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
 
 
@@ -64,6 +68,7 @@ class Director:
     store: ModelStore
     safety: Safety
     guard_limits: GuardLimits
+    shadow_limits: ShadowLimits
     records: Path
     rate: float
     emit: Callable[[str, str, str], None]
@@ -73,6 +78,8 @@ class Director:
     _queue: deque[Progress] = field(default_factory=deque)
     _known: dict[str, Progress] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
+    _deploying: threading.RLock = field(default_factory=threading.RLock)
+    """Held where what is live and whether a flight is under way must not change apart."""
     _number: int = 0
 
     # Asked by the ground, on the service thread
@@ -86,27 +93,71 @@ class Director:
         except InputError as error:
             return {"accepted": False, "reason": str(error)}
 
-    def deploy(self, onnx: bytes) -> dict[str, Any]:
-        """Check a model and make it live; refused in flight: the check takes time from the control."""
-        if self.flight.phase != IDLE:
-            return {"accepted": False, "reason": "a flight is under way; deploy after landing"}
-        answer = self.store.deploy(onnx)
-        kind = "model_accepted" if answer["accepted"] else "model_refused"
-        self.emit("info" if answer["accepted"] else "warning", kind, answer["reason"])
-        return answer
+    def deploy(self, onnx: bytes, shadow: float | None = None) -> dict[str, Any]:
+        """Check a model; make it live on the ground, or let it prove itself for `shadow` s in flight.
+
+        Blocks for the check, which has a process of its own. The answer's `state` is `live` or `shadow`; what
+        became of a model in the shadow is told by events and the status.
+        """
+        candidate = self.flight.candidate
+        if candidate is not None:
+            reason = f"{candidate.title} is in the shadow for another {candidate.remaining:.1f} s; wait, or roll back"
+            return {"accepted": False, "reason": reason}
+        low, high = _SHADOW_SECONDS
+        if shadow is not None and not low <= shadow <= high:
+            return {"accepted": False, "reason": f"shadow = {shadow:g} s is outside {low:g} to {high:g} s"}
+        finding = self.store.stage(onnx)
+        if finding.info is None:
+            self.emit("warning", "model_refused", finding.reason)
+            return {"accepted": False, "reason": finding.reason}
+        name, title = finding.info.hash, f"{finding.info.hash} ({finding.reason})"
+        with self._deploying:
+            if self.flight.phase == IDLE:
+                return self._make_live(name, title, finding.reason)
+        if name == self.store.live_name:
+            self.store.discard(name)
+            return {
+                "accepted": True,
+                "state": "live",
+                "reason": "it is live already",
+                **self.store.describe(),
+            }
+        self.emit("info", "model_staged", f"{title}: accepted by its check, evaluated but not applied")
+        reason = self._try(name, shadow)
+        if reason:
+            self.emit("warning", "model_refused", f"{title}: {reason}")
+            return {"accepted": False, "reason": reason}
+        reason = f"{finding.reason}; in the shadow"
+        return {"accepted": True, "state": "shadow", "reason": reason, **self.store.describe()}
 
     def roll_back(self) -> dict[str, Any]:
-        """Make the previous model live."""
-        if self.flight.phase != IDLE:
-            return {"accepted": False, "reason": "a flight is under way; roll back after landing"}
-        answer = self.store.roll_back()
-        if answer["accepted"]:
-            self.emit("info", "model_rolled_back", answer["reason"])
-        return answer
+        """Withdraw the model in the shadow; without one, make the previous model live, also in flight."""
+        candidate = self.flight.candidate
+        if candidate is not None:
+            self.flight.withdraw_candidate()
+            reason = (
+                f"{candidate.title} is withdrawn from the shadow; live stays {self.store.live_name or 'none'}"
+            )
+            return {"accepted": True, "reason": reason, **self.store.describe()}
+        with self._deploying:
+            earlier = self.store.previous_name
+            try:
+                watch = (
+                    self._watch(self.store.open(earlier)) if earlier and self.flight.phase != IDLE else None
+                )
+            except InputError as error:
+                return {"accepted": False, "reason": str(error)}
+            answer = self.store.roll_back()
+            if answer["accepted"]:
+                self.flight.roll_back(watch)
+                self.flight.live = self.store.live_name
+                self.emit("info", "model_rolled_back", f"by command: {answer['reason']}")
+            return answer
 
     def status(self) -> dict[str, Any]:
         """What the companion is doing, for JSON."""
         latest, flight = self.link.latest, self.flight
+        candidate = flight.candidate
         with self._lock:
             missions = [
                 {
@@ -134,6 +185,14 @@ class Director:
             "not_ready": self.not_ready(),
             "mission": mission.identity if mission else "",
             "guard": mission.guard.status if mission and mission.guard else "off",
+            "shadow": {}
+            if candidate is None
+            else {
+                "hash": candidate.name,
+                "title": candidate.title,
+                "remaining": round(candidate.remaining, 2),
+                "refused": candidate.refused,
+            },
             "missions": missions,
             "rates": {}
             if rates is None
@@ -221,22 +280,90 @@ class Director:
         }
 
     def _prepared(self, identity: str, path: Trajectory, controller: str, repeat: int) -> Mission:
-        model = self.store.live if controller == "corrected" else None
+        guard = self._guard() if controller == "corrected" else None
+        return Mission(identity, path, controller, repeat, guard)
+
+    def _guard(self) -> Guard | None:
+        """A guard around the live model; None without one."""
+        model = self.store.live
         if model is None:
-            return Mission(identity, path, controller, repeat)
+            return None
+
+        def tripped(name: str, reason: str) -> None:
+            self.emit("warning", "guard_trip", f"correction {name} switched off: {reason}")
+
         info = model.info
+        return Guard(
+            model,
+            info.features,
+            self.guard_limits,
+            info.wants_yaw,
+            tripped,
+            name=info.hash,
+            actuation=info.actuation,
+        )
 
-        def tripped(reason: str) -> None:
-            self.emit("warning", "guard_trip", f"correction {info.hash} switched off: {reason}")
+    def _watch(self, model: Model) -> Watch:
+        info = model.info
+        return Watch(
+            model, info.features, self.guard_limits, info.wants_yaw, info.hash, actuation=info.actuation
+        )
 
-        guard = Guard(model, info.features, self.guard_limits, info.wants_yaw, tripped)
-        return Mission(identity, path, controller, repeat, guard, info.hash)
+    def _try(self, name: str, seconds: float | None = None) -> str:
+        """Put the staged model into the shadow of the flight; '' or why not."""
+        try:
+            watch = self._watch(self.store.open(name))
+        except InputError as error:
+            self.store.discard(name)
+            return str(error)
+        self.flight.try_model(Shadow(watch, self.shadow_limits, self.store.title(name), seconds or 0.0))
+        return ""
+
+    def _make_live(self, name: str, title: str, reason: str) -> dict[str, Any]:
+        """The staged model becomes live on the ground."""
+        failed = self.store.commit(name)
+        if failed:
+            self.store.discard(name)
+            self.emit("warning", "model_refused", f"{title}: {failed}")
+            return {"accepted": False, "reason": failed}
+        self.flight.live = self.store.live_name
+        self.emit("info", "model_live", f"{title} is live")
+        return {"accepted": True, "state": "live", "reason": reason, **self.store.describe()}
+
+    def _settle(self) -> None:
+        """Put on the disk what became of models in flight."""
+        while self.flight.decisions:
+            self._keep(self.flight.decisions.popleft())
+        self.flight.live = self.store.live_name
+
+    def _keep(self, decision: Decision) -> None:
+        name, store = decision.model, self.store
+        failed = ""
+        if decision.kind == "live":
+            failed = store.commit(name)
+        elif decision.kind == "rolled_back":
+            failed = store.withdraw(name)
+        elif decision.kind == "refused":
+            store.discard(name)
+        elif self.flight.mission is not None and self.flight.mission.guard is None:
+            # Nothing was corrected in that flight, so that this is a deployment on the ground like any other.
+            self._make_live(name, store.title(name), "")
+        else:
+            self.emit(
+                "warning",
+                "model_staged",
+                f"{store.title(name)}: landed before it proved itself; the next corrected flight goes on with "
+                "it, and deployed again on the ground it is live at once",
+            )
+        if failed:
+            self.emit("warning", "model_not_kept", f"{store.title(name)}: {failed}")
 
     # The main thread
 
     def run(self) -> None:
         """Fly what is asked until `stopping` is set; then land what is in the air and return."""
         while not self.stopping.wait(0.02):
+            self._settle()
             with self._lock:
                 progress = self._queue.popleft() if self._queue else None
             if progress is not None:
@@ -254,11 +381,22 @@ class Director:
             self._stop_recording()
             return
         self._accompany()
+        self._settle()
         outcome = self.flight.outcome
         progress.state = "finished" if outcome == "finished" else "aborted"
         progress.reason = outcome
         self.emit("info", "mission_ended", f"{mission.trajectory.name}: {outcome}")
         self._stop_recording()
+
+    def _renewed(self, progress: Progress) -> str:
+        """What is live now flies, not what was when the mission was asked for; '' or the reason why not."""
+        if progress.mission.guard is None:
+            return ""
+        guard = self._guard()
+        if guard is None:
+            return "no model is live any more; deploy one"
+        progress.mission = replace(progress.mission, guard=guard)
+        return ""
 
     def _check(self) -> str:
         self.rates = self.link.measure(0.5)
@@ -268,7 +406,12 @@ class Director:
         """Stream, Offboard, arm, go; '' or the reason why not."""
         latest, flight = self.link.latest, self.flight
         sent = flight.sent
-        flight.prepare(progress.mission)
+        with self._deploying:
+            reason = self._renewed(progress)
+            if reason:
+                return reason
+            flight.prepare(progress.mission)
+            self._wait(lambda: flight.phase != IDLE, 0.5)
         time.sleep(_STREAM_BEFORE_OFFBOARD)
         if flight.sent == sent:
             return "no odometry, so no setpoint could be sent"
@@ -286,7 +429,12 @@ class Director:
         if latest.flight_mode != "OFFBOARD":
             return f"the mode changed to {latest.flight_mode} while arming"
         flight.take_off()
-        return "" if self._wait(lambda: flight.home_set, 1.0) else "no odometry after arming"
+        if not self._wait(lambda: flight.home_set, 1.0):
+            return "no odometry after arming"
+        staged = self.store.staged_name
+        if staged and flight.candidate is None:
+            self._try(staged)
+        return ""
 
     def _accompany(self) -> None:
         """Do what the flight asks for that may block, until it is over."""
@@ -295,6 +443,7 @@ class Director:
         ticked, ticked_at, told = flight.ticked, time.monotonic(), False
         while flight.phase != IDLE:
             time.sleep(0.02)
+            self._settle()
             now = time.monotonic()
             if self.stopping.is_set() and flight.phase not in (LANDING, SILENT):
                 flight.land("the companion is shutting down", return_home=False)
@@ -332,7 +481,7 @@ class Director:
             "mission": mission.identity,
             "trajectory": mission.trajectory.name,
             "controller": mission.controller,
-            "model": mission.model,
+            "model": mission.guard.live if mission.guard is not None else "",
             "repeat": str(mission.repeat),
             **{f"parameter.{key}": str(value) for key, value in mission.trajectory.parameters.items()},
         }

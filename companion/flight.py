@@ -17,9 +17,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from companion.control import IDLE_STEP, ControlLaw, ControlStep, State
+from companion.control import IDLE_STEP, Attitude, ControlLaw, ControlStep, State, euler, features
+from companion.controllers import CONTROLLERS, CORRECTED, Controller, TrimLimits, make_controller
 from companion.guard import Guard
+from companion.shadow import Shadow, error_acceleration
 from companion.vehicle_link import Latest, Odometry
+from companion.watch import Watch
 from models.errors import InputError
 from models.reference import Trajectory, transfer
 from models.trajectory import ReferenceSample, Waypoint
@@ -27,7 +30,6 @@ from models.trajectory import ReferenceSample, Waypoint
 Vector = tuple[float, float, float]
 
 IDLE, TAKEOFF, MISSION, LANDING, SILENT = "idle", "takeoff", "mission", "landing", "silent"
-CONTROLLERS = ("lqr", "corrected")
 _SETTLED_DISTANCE, _SETTLED_SPEED = 0.15, 0.25
 _LAND_FROM = 0.4  # m above ground at which the autopilot's own Land mode takes the last bit
 
@@ -69,21 +71,23 @@ class Safety:
 
 @dataclass(frozen=True)
 class Mission:
-    """What to fly: a trajectory (home frame), how often, with which controller, guarded by what."""
+    """What to fly: a trajectory (home frame), how often, with which controller, guarded by what.
+
+    `guard` holds the models that correct; none for a controller without correction.
+    """
 
     identity: str
     trajectory: Trajectory
     controller: str = "lqr"
     repeat: int = 1
     guard: Guard | None = None
-    model: str = ""
 
     def __post_init__(self) -> None:
         if self.controller not in CONTROLLERS:
             raise InputError(
                 f"controller '{self.controller}' is unknown; use one of {', '.join(CONTROLLERS)}"
             )
-        if (self.guard is None) != (self.controller == "lqr"):
+        if (self.guard is None) != (self.controller != CORRECTED):
             raise InputError("controller 'corrected' needs a deployed model")
 
 
@@ -97,9 +101,24 @@ class Leg:
     name: str = ""
 
 
+@dataclass(frozen=True)
+class Decision:
+    """What became of a model in flight: `kind` is `live`, `refused`, `rolled_back` (the live one, tripped) or
+    `undecided` (the flight ended before).
+    """
+
+    kind: str
+    model: str
+    reason: str = ""
+
+
 @dataclass(slots=True)
 class Outcome:
-    """What one tick decided: `step` and `reference` are None where nothing is sent."""
+    """What one tick decided: `step` and `reference` are None where nothing is sent.
+
+    `model` is the live one's hash, whether it acts or not; `shadow` that of the model in the shadow, and
+    `shadow_raw` what it returned (m/s², heading frame).
+    """
 
     phase: str
     interval: float
@@ -111,6 +130,8 @@ class Outcome:
     controller: str = ""
     model: str = ""
     trajectory: str = ""
+    shadow: str = ""
+    shadow_raw: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass
@@ -118,12 +139,15 @@ class Flight:
     """The state machine of a flight; `tick` belongs to the control thread, the rest may be called from any.
 
     `on_event(level, kind, text)` must only enqueue. Orders from other threads wait for the next tick.
-    `wants_land` is what the flight asks of whoever may block: the autopilot's Land mode.
+    `wants_land` is what the flight asks of whoever may block: the autopilot's Land mode. `live` is the hash of the
+    model that the next corrected flight uses; whoever keeps the models sets it. `decisions` tells what became of
+    models in flight, for whoever keeps them to put on the disk.
     """
 
     law: ControlLaw
     safety: Safety
     on_event: Callable[[str, str, str], None] = lambda level, kind, text: None
+    trim: TrimLimits = field(default_factory=TrimLimits)
     phase: str = IDLE
     wants_land: bool = False
     sent: int = 0
@@ -131,6 +155,9 @@ class Flight:
     home: Vector = (0.0, 0.0, 0.0)
     mission: Mission | None = None
     outcome: str = ""
+    live: str = ""
+    candidate: Shadow | None = None
+    decisions: deque[Decision] = field(default_factory=deque)
     _orders: deque[Callable[[], None]] = field(default_factory=deque)
     _legs: deque[Leg] = field(default_factory=deque)
     _leg: Leg | None = None
@@ -141,6 +168,9 @@ class Flight:
     _yaw: float = 0.0
     _sending: bool = False
     _unwatched: tuple[Odometry, Odometry | None, Outcome] | None = None
+    _guarded: str = ""
+    _controller: Controller | None = None
+    _thrust: float = 0.0
     _here: Waypoint = (0.0, 0.0, 0.0, 0.0)
 
     # Orders
@@ -151,6 +181,8 @@ class Flight:
         def order() -> None:
             if self.phase == IDLE:
                 self.mission, self.phase, self.outcome = mission, TAKEOFF, ""
+                self._guarded = mission.guard.live if mission.guard is not None else ""
+                self._controller = make_controller(mission.controller, self.law, mission.guard, self.trim)
                 self._legs.clear()
                 self._leg, self.wants_land = None, False
                 self._low_since = math.inf
@@ -184,6 +216,41 @@ class Flight:
         """End the flight: over home, or where it is now."""
         self._orders.append(lambda: self._land(reason, return_home))
 
+    def try_model(self, shadow: Shadow) -> None:
+        """Evaluate a model beside this flight; in a corrected one it takes over where it proves itself."""
+
+        def order() -> None:
+            guard = self.mission.guard if self.mission is not None else None
+            tripped = guard.why_tripped(shadow.name) if guard is not None else ""
+            if self.phase in (IDLE, SILENT):
+                self.decisions.append(Decision("undecided", shadow.name))
+            elif tripped:
+                self._refuse(shadow, f"it tripped in this flight: {tripped}")
+            else:
+                self.candidate = shadow
+
+        self._orders.append(order)
+
+    def withdraw_candidate(self) -> None:
+        """Evaluate the model in the shadow no longer."""
+
+        def order() -> None:
+            if self.candidate is not None:
+                self._refuse(self.candidate, "withdrawn by the ground")
+
+        self._orders.append(order)
+
+    def roll_back(self, earlier: Watch | None) -> None:
+        """Fade over to the last good model; where this flight has none, to `earlier` or the plain cascade."""
+
+        def order() -> None:
+            guard = self.mission.guard if self.mission is not None else None
+            if guard is not None and self.phase != IDLE:
+                guard.roll_back(earlier)
+                self._guarded = guard.live
+
+        self._orders.append(order)
+
     def give_up(self, reason: str) -> None:
         """Fall silent, so that the autopilot's own failsafe ends the flight."""
         self._orders.append(lambda: self._silence("gave_up", reason))
@@ -216,13 +283,16 @@ class Flight:
         return out
 
     def watch(self, latest: Latest) -> None:
-        """Look for reasons to end the flight in the odometry of the last `tick`.
+        """Look for reasons to end the flight in the odometry of the last `tick`, and at the models.
 
         Called after its setpoint has left, so that it costs no latency; what it finds acts on the next tick.
         """
         if self._unwatched is not None and self._leg is not None and self.phase not in (IDLE, SILENT):
             odometry, previous, out = self._unwatched
             self._watch(odometry, previous, out.interval, out.position, latest)
+            self._watch_guard()
+            if out.step is not None:
+                self._watch_candidate(odometry, out, latest)
 
     def _decide(self, odometry: Odometry, latest: Latest) -> Outcome:
         previous, self._previous = self._previous, odometry
@@ -239,7 +309,7 @@ class Flight:
             self._orders.popleft()()
             hx, hy, hz = self.home
             position = (px - hx, py - hy, pz - hz)
-        out = Outcome(self.phase, interval, position)
+        out = Outcome(self.phase, interval, position, model=self.live)
         if self.phase == IDLE:
             return out
         self._watch_mode(latest)
@@ -247,17 +317,28 @@ class Flight:
         mission = self.mission
         if mission is None or self.phase in (IDLE, SILENT):
             return out
-        out.controller, out.model, out.trajectory = mission.controller, mission.model, mission.trajectory.name
+        out.controller, out.trajectory = mission.controller, mission.trajectory.name
+        if mission.guard is not None:
+            out.model = mission.guard.live
         if self._leg is None:
             out.step = IDLE_STEP
             return out
         if latest.flight_mode != "OFFBOARD":
             return out  # landing by the autopilot's own mode
-        out.reference = reference = self._reference(position, odometry)
+        out.reference = self._reference(position, odometry)
         out.phase = self.phase
-        state = State(position, odometry.velocity, odometry.quaternion, position[2], latest.battery_voltage)
+        state = State(
+            position,
+            odometry.velocity,
+            odometry.quaternion,
+            position[2],
+            latest.battery_voltage,
+            odometry.angular_velocity,
+            _finite(latest.specific_force),
+        )
         guard = mission.guard
-        out.step = self.law.step(state, reference, interval, guard)
+        assert self._controller is not None
+        out.step = self._controller.step(state, self._preview, interval)
         if guard is not None:
             out.guard, out.inference = guard.status, guard.inference_time
         return out
@@ -303,6 +384,11 @@ class Flight:
         self._here = (*reference.position, reference.yaw)
         return reference
 
+    def _preview(self, ahead: float) -> ReferenceSample:
+        """The reference of this leg `ahead` s from now; it holds still after the leg's end."""
+        assert self._leg is not None
+        return self._leg.trajectory.at(self._now - self._leg_begin + ahead)
+
     def _next_leg(self) -> None:
         if not self._legs:
             self.wants_land = True  # keep the last reference until the autopilot has taken over
@@ -316,12 +402,16 @@ class Flight:
             self.on_event("info", "mission_started", f"flying {name}, {self._leg.trajectory.duration:.1f} s")
             if guard is not None:
                 guard.start()
+            if self._controller is not None:
+                self._controller.start()
         elif self.phase == LANDING and before == MISSION:
             if not self.outcome:
                 self.outcome = "finished"
                 self.on_event("info", "mission_flown", "trajectory flown, landing")
             if guard is not None:
                 guard.stop()
+            if self._controller is not None:
+                self._controller.stop()
 
     def _watch_mode(self, latest: Latest) -> None:
         """The pilot wins, and a vehicle that is not armed flies no more."""
@@ -363,6 +453,57 @@ class Flight:
         if self._now - self._low_since > safety.battery_patience and self.phase != LANDING:
             self._land(f"battery at {latest.battery_voltage:.1f} V", return_home=True, kind="battery_low")
 
+    def _watch_guard(self) -> None:
+        """Tell where the guard went back to the last good model by itself."""
+        guard = self.mission.guard if self.mission is not None else None
+        if guard is not None and guard.live != self._guarded:
+            gone, self._guarded = self._guarded, guard.live
+            text = f"{gone} tripped ({guard.why_tripped(gone)}): back to {guard.live}"
+            self.decisions.append(Decision("rolled_back", gone, guard.why_tripped(gone)))
+            self.on_event("warning", "model_rolled_back", text)
+
+    def _watch_candidate(self, odometry: Odometry, out: Outcome, latest: Latest) -> None:
+        """One tick of the model in the shadow, at the measured state, and what follows from it."""
+        assert out.step is not None
+        # What the accelerometer felt is what the command before this one did.
+        thrust, self._thrust = self._thrust, out.step.command.thrust
+        shadow = self.candidate
+        if shadow is None:
+            return
+        vehicle = self.law.vehicle
+        voltage = latest.battery_voltage if latest.battery_voltage > 0.0 else vehicle.nominal_voltage
+        roll, pitch, yaw = euler(odometry.quaternion)
+        state = State(out.position, odometry.velocity, odometry.quaternion, out.position[2], voltage)
+        force, measured = _finite(latest.specific_force), None
+        if force is not None:
+            measured = error_acceleration(odometry.quaternion, force, thrust, vehicle.mass)
+        values = features(state, yaw, Attitude(roll, pitch, thrust), voltage, shadow.watch.wants_yaw)
+        flying = out.phase == MISSION  # only there would it act
+        out.shadow, out.guard = shadow.name, f"{out.guard}, shadow"
+        out.shadow_raw = shadow.step(values, measured, out.interval if flying else 0.0)
+        if shadow.refused:
+            self._refuse(shadow, shadow.refused)
+            return
+        guard = self.mission.guard if self.mission is not None else None
+        if not shadow.passed or not flying or (guard is not None and not guard.settled):
+            return
+        self.candidate = None
+        own, plain = (f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in shadow.errors)
+        text = f"{shadow.title} passed: off by {own} m/s^2, the plain linear model by {plain}"
+        self.on_event("info", "model_shadowed", text)
+        self.decisions.append(Decision("live", shadow.name))
+        if guard is None:
+            self.on_event("info", "model_live", f"{shadow.title} is live from the next corrected flight on")
+            return
+        guard.succeed(shadow.watch)
+        gone, self._guarded = self._guarded, guard.live
+        self.on_event("info", "model_live", f"{shadow.title} takes over from {gone or 'the plain cascade'}")
+
+    def _refuse(self, shadow: Shadow, reason: str) -> None:
+        self.candidate = None
+        self.decisions.append(Decision("refused", shadow.name, reason))
+        self.on_event("warning", "model_refused", f"{shadow.title}: {reason}")
+
     def _land(self, reason: str, return_home: bool, kind: str = "landing") -> None:
         if self.phase not in (TAKEOFF, MISSION, LANDING):
             return
@@ -373,6 +514,8 @@ class Flight:
         self.on_event("warning", kind, f"{reason}: landing {'at home' if return_home else 'here'}")
         if self.mission is not None and self.mission.guard is not None:
             self.mission.guard.stop()
+        if self._controller is not None:
+            self._controller.stop()
         self._legs.clear()
         if return_home:
             self._legs.extend(self._way_home(self._here))
@@ -392,3 +535,14 @@ class Flight:
         self.phase, self.outcome, self.wants_land = IDLE, outcome, False
         self._leg = None
         self._legs.clear()
+        shadow, self.candidate = self.candidate, None
+        if shadow is not None:
+            self.decisions.append(Decision("undecided", shadow.name))
+
+
+def _finite(force: tuple[float | None, ...] | None) -> Vector | None:
+    """The specific force, where the accelerometer has told a whole one."""
+    if force is None or None in force:
+        return None
+    x, y, z = force
+    return (x, y, z) if math.isfinite(x + y + z) else None  # type: ignore[operator,return-value]

@@ -1,70 +1,55 @@
-"""The guard: it lets a learned correction act on the vehicle only as far as it can be trusted.
+"""The guard: it lets learned corrections act on the vehicle only as far as they can be trusted.
 
-It believes nothing about the model. Whatever that returns (NaN, infinity, huge numbers), however long it
-takes, or if it raises: the applied correction stays finite, within an authority per axis and a slew per axis.
-Anything that cannot be right trips the guard. A trip latches: the correction runs down to zero at the slew
-limit, the model is not called again, and the flight goes on with the plain cascade until somebody on the
-ground starts another one.
+Each model has a `Watch`. Of those one is live; another may take over while flying. Old and new are then faded
+into each other with weights that sum to what they summed to before, so that the applied correction has no
+step, and the previous model stays loaded as the last good one. When the live model trips, the last good one
+fades in again; without one, the correction runs down to zero and the flight goes on with the plain cascade.
+A model that tripped never acts again in this flight.
+
+Whatever the models do, the applied correction stays finite, within the authority and the slew per axis.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple
+from typing import NamedTuple
 
-Vector = tuple[float, float, float]
-ZERO: Vector = (0.0, 0.0, 0.0)
+from companion.actuation import ACTS_AT_ONCE, Actuation
+from companion.watch import ZERO, GuardLimits, Range, Vector, Watch
 
-OFF, FADING_IN, ACTIVE, FADING_OUT, TRIPPED = "off", "fading_in", "active", "fading_out", "tripped"
+__all__ = ["Guard", "GuardLimits", "Range", "Watch"]
+
+OFF, FADING_IN, ACTIVE, FADING_OVER, FADING_OUT, TRIPPED = (
+    "off",
+    "fading_in",
+    "active",
+    "fading_over",
+    "fading_out",
+    "tripped",
+)
 
 LONGEST_STEP = 0.1
 """Seconds of slew and fading that one tick may use at most, so that a gap in the odometry gives no jump."""
 
-_FLOORS = {"m": 0.2, "m/s": 0.5, "V": 0.5, "1": 0.1}
-"""Least margin around the training range, by unit: noise and trim, where training hardly moved a feature."""
 
+class Correction(NamedTuple):
+    """Error acceleration to cancel, m/s², heading frame: as applied, and as the live model returned it.
 
-@dataclass(frozen=True)
-class Range:
-    """The range of one feature seen in training, in `unit`."""
-
-    name: str
-    unit: str
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
-class GuardLimits:
-    """How far a correction is trusted.
-
-    `authority` m/s² and `slew` m/s³ per axis of the heading frame. A raw value beyond `absurd` times the
-    authority trips; one beyond the authority is cut and trips after `patience` s without a pause. Outside the
-    training range the correction is scaled down, to nothing at `margin` times the range's width, and trips
-    after `patience` s beyond. `deadline` s for one inference: `misses` late ones in a row trip, as does a single
-    one of more than `stall` s. One late inference alone says more of the operating system than of the model.
-    `fade` s from nothing to full effect and back.
+    `rate` (m/s³, x and y) is how fast the applied one is about to change.
     """
 
-    authority: Vector = (3.0, 3.0, 4.0)
-    slew: Vector = (30.0, 30.0, 40.0)
-    absurd: float = 5.0
-    margin: float = 0.25
-    patience: float = 1.0
-    deadline: float = 0.002
-    misses: int = 5
-    stall: float = 0.05
-    fade: float = 1.0
+    applied: Vector
+    rate: tuple[float, float]
+    raw: Vector
 
 
 class Guard:
-    """Watches one model during one flight.
+    """Stands between models and command during one flight; begins with one model, live and not yet faded in.
 
-    `model` maps features to three error accelerations (m/s², heading frame). `ranges` are the features'
-    training ranges in the model's order. `on_trip` is told the reason once, from the thread that calls
-    `step`, and must not block. `clock` is for tests.
+    `model`, `ranges`, `wants_yaw`, `name` and `clock` as for `Watch`. `on_trip` is told the name of a model and
+    the reason once, from the thread that calls `step`, and must not block. All methods belong to that thread.
     """
 
     def __init__(
@@ -73,121 +58,174 @@ class Guard:
         ranges: Sequence[Range],
         limits: GuardLimits | None = None,
         wants_yaw: bool = False,
-        on_trip: Callable[[str], None] | None = None,
+        on_trip: Callable[[str, str], None] | None = None,
         clock: Callable[[], float] = time.perf_counter,
+        name: str = "",
+        actuation: Actuation = ACTS_AT_ONCE,
     ) -> None:
-        self.wants_yaw = wants_yaw
         self.limits = limits if limits is not None else GuardLimits()
+        self.wants_yaw = wants_yaw
         self.inference_time = 0.0
-        self._model = model
-        self._ranges = [(r.name, r.low, r.high, _margin(r, self.limits.margin)) for r in ranges]
         self._on_trip = on_trip
-        self._clock = clock
-        self._mode, self._reason = OFF, ""
-        self._weight = 0.0
+        self._live: Watch | None = Watch(model, ranges, self.limits, wants_yaw, name, clock, actuation)
+        self._last_good: Watch | None = None
+        self._weights: dict[Watch, float] = {self._live: 0.0}
+        self._tripped: dict[str, Watch] = {}
+        self._running = False
         self._applied = ZERO
-        self._late = 0
-        self._outside = self._saturated = 0.0
 
     @property
     def status(self) -> str:
-        """`off`, `fading_in`, `active`, `fading_out`, or `tripped: REASON`, as in a tick."""
-        return f"{TRIPPED}: {self._reason}" if self._mode == TRIPPED else self._mode
+        """`off`, `fading_in`, `active`, `fading_over` (from one model to another), `fading_out`, or
+        `tripped: REASON`, as in a tick.
+        """
+        live = self._live
+        if live is not None and live.tripped:
+            return f"{TRIPPED}: {live.reason}"
+        if not self._running or live is None:
+            return FADING_OUT if any(self._weights.values()) else OFF
+        if any(weight for watch, weight in self._weights.items() if watch is not live):
+            return FADING_OVER
+        return ACTIVE if self._weights[live] == 1.0 else FADING_IN
 
     @property
     def tripped(self) -> bool:
-        """Whether it gave up on this model for the rest of the flight."""
-        return self._mode == TRIPPED
+        """Whether the live model tripped and no other took over: the plain cascade flies on."""
+        return self._live is not None and self._live.tripped
+
+    @property
+    def live(self) -> str:
+        """Name of the live model; empty after the last one was rolled back."""
+        return self._live.name if self._live is not None else ""
+
+    @property
+    def last_good(self) -> str:
+        """Name of the model that takes over where the live one trips; empty without one."""
+        return self._last_good.name if self._last_good is not None else ""
+
+    @property
+    def settled(self) -> bool:
+        """Whether no model is being faded into another."""
+        return all(watch is self._live or weight == 0.0 for watch, weight in self._weights.items())
 
     @property
     def applied(self) -> Vector:
         """The correction of the last step, m/s², heading frame."""
         return self._applied
 
+    def why_tripped(self, name: str) -> str:
+        """Why this model tripped in this flight; empty where it did not."""
+        return self._tripped[name].reason if name in self._tripped else ""
+
     def start(self) -> None:
-        """Fade the correction in. No effect after a trip: that latches."""
-        if self._mode in (OFF, FADING_OUT):
-            self._mode = FADING_IN
+        """Fade the correction in. No effect on a model that tripped: that latches."""
+        self._running = True
 
     def stop(self) -> None:
         """Fade the correction out."""
-        if self._mode in (FADING_IN, ACTIVE):
-            self._mode = FADING_OUT
+        self._running = False
 
-    def step(self, features: Sequence[float], dt: float) -> tuple[Vector, Vector]:
-        """The correction to apply now and the model's raw answer, m/s², heading frame; `dt` s since the last
-        step.
+    def succeed(self, watch: Watch) -> None:
+        """Make another model the live one, and the present one the last good one; they fade over."""
+        if self._live is not None and not self._live.tripped:
+            self._last_good = self._live
+        self._enter(watch)
 
-        The applied one is finite, within `authority`, and within `slew * dt` of the previous one, always.
+    def roll_back(self, earlier: Watch | None = None) -> None:
+        """Make the last good model live again; without one `earlier`, and without that the plain cascade."""
+        target = self._last_good if self._last_good is not None else earlier
+        self._last_good = None
+        if target is None:
+            self._live = None
+        else:
+            self._enter(target)
+
+    def trip(self, reason: str) -> None:
+        """Give up on the live model for a reason that only others can see."""
+        if self._live is not None and not self._live.tripped:
+            self._live.trip(reason)
+            self._drop(self._live)
+
+    @property
+    def engaged(self) -> float:
+        """Share, 0 to 1, to which models act now."""
+        return min(1.0, sum(self._weights.values()))
+
+    @property
+    def actuation(self) -> Actuation:
+        """What the models that act know of the path from command to motion, by their weights."""
+        acting = [(weight, watch.actuation) for watch, weight in self._weights.items() if weight > 0.0]
+        if len(acting) < 2:
+            return acting[0][1] if acting else ACTS_AT_ONCE
+        total = sum(weight for weight, _ in acting)
+        return Actuation(
+            *(
+                sum(w * n for w, n in column) / total
+                for column in zip(
+                    *([(weight, number) for number in astuple(one)] for weight, one in acting), strict=True
+                )
+            )
+        )
+
+    def step(self, rows: Sequence[Sequence[float]], ahead: float, dt: float) -> Correction:
+        """The correction for three rows of features: where tilt acts, `ahead` s later, where thrust acts; `dt` s
+        since the last step.
+
+        The applied one is finite, within `authority`, and within `slew * dt` of the previous one, always; its rate
+        within `slew`.
         """
         dt = min(LONGEST_STEP, dt) if dt > 0.0 else 0.0  # false for NaN as well
-        raw = ZERO
         self.inference_time = 0.0
-        if self._mode in (FADING_IN, ACTIVE, FADING_OUT):
-            self._fade(dt)
-            raw, wanted = self._evaluate(features, dt)
-        else:
-            wanted = ZERO
-        self._applied = self._slewed(wanted, dt)
-        return self._applied, raw
+        self._fade(dt)
+        x, y, z = raw = ZERO
+        rx = ry = 0.0
+        for watch, weight in list(self._weights.items()):
+            if weight == 0.0 and not (self._running and watch is self._live):
+                continue
+            look = watch.look(rows, ahead, dt)
+            self.inference_time += watch.inference_time
+            if watch is self._live:
+                raw = look.raw
+            if watch.tripped:
+                self._drop(watch)
+                continue
+            x, y, z = x + weight * look.wanted[0], y + weight * look.wanted[1], z + weight * look.wanted[2]
+            rx, ry = rx + weight * look.rate[0], ry + weight * look.rate[1]
+        self._applied = self._slewed((x, y, z), dt)
+        a, b, _ = self.limits.slew
+        return Correction(self._applied, (min(a, max(-a, rx)), min(b, max(-b, ry))), raw)
+
+    def _enter(self, watch: Watch) -> None:
+        self._live = watch = self._tripped.get(watch.name, watch) if watch.name else watch
+        if not watch.tripped:
+            self._weights.setdefault(watch, 0.0)
+        self.wants_yaw = any(one.wants_yaw for one in self._weights)
 
     def _fade(self, dt: float) -> None:
+        """Move the weights: all down, but the live one's up into what the others leave of one."""
         change = dt / self.limits.fade
-        if self._mode == FADING_OUT:
-            self._weight = max(0.0, self._weight - change)
-            if self._weight == 0.0:
-                self._mode = OFF
-        else:
-            self._weight = min(1.0, self._weight + change)
-            self._mode = ACTIVE if self._weight == 1.0 else FADING_IN
+        others = 0.0
+        for watch, weight in list(self._weights.items()):
+            if self._running and watch is self._live:
+                continue
+            self._weights[watch] = weight = max(0.0, weight - change)
+            others += weight
+            if weight == 0.0 and watch is not self._live:
+                del self._weights[watch]
+        live = self._live
+        if self._running and live is not None and not live.tripped:
+            self._weights[live] = min(1.0 - others, self._weights[live] + change)
 
-    def _evaluate(self, features: Sequence[float], dt: float) -> tuple[Vector, Vector]:
-        begin = self._clock()
-        try:
-            x, y, z = self._model(features)
-            raw = (float(x), float(y), float(z))
-        except Exception as error:  # noqa: BLE001 - whatever a model raises, the flight goes on without it
-            return ZERO, self._trip(f"the model raised {type(error).__name__}")
-        self.inference_time = self._clock() - begin
-        if not (math.isfinite(raw[0]) and math.isfinite(raw[1]) and math.isfinite(raw[2])):
-            return ZERO, self._trip("the model returned a number that is not finite")
-        if not self._in_time(self.inference_time):
-            return raw, self._trip(f"inference took {1e3 * self.inference_time:.1f} ms")
-        excess = max(abs(raw[i]) / self.limits.authority[i] for i in range(3))
-        if excess > self.limits.absurd:
-            return raw, self._trip(f"a correction {excess:.0f} times its authority")
-        self._saturated = self._saturated + dt if excess > 1.0 else 0.0
-        if self._saturated > self.limits.patience:
-            return raw, self._trip(f"beyond its authority for {self.limits.patience:g} s")
-        trust, name = self._trust(features)
-        self._outside = self._outside + dt if trust == 0.0 else 0.0
-        if self._outside > self.limits.patience:
-            return raw, self._trip(f"{name} outside its training range for {self.limits.patience:g} s")
-        scale = self._weight * trust
-        return raw, (scale * raw[0], scale * raw[1], scale * raw[2])
-
-    def _in_time(self, seconds: float) -> bool:
-        self._late = self._late + 1 if seconds > self.limits.deadline else 0
-        return self._late < self.limits.misses and seconds <= self.limits.stall
-
-    def _trust(self, features: Sequence[float]) -> tuple[float, str]:
-        """1 inside the training range, falling to 0 across the margin around it, and the feature that
-        decides.
-        """
-        trust, worst = 1.0, ""
-        for value, (name, low, high, margin) in zip(features, self._ranges, strict=True):
-            outside = low - value if value < low else value - high
-            if not outside <= 0.0:  # true for NaN as well
-                share = 1.0 - outside / margin
-                if not share >= trust:
-                    trust, worst = (share if share > 0.0 else 0.0), name
-        return trust, worst
-
-    def _trip(self, reason: str) -> Vector:
-        self._mode, self._reason, self._weight = TRIPPED, reason, 0.0
+    def _drop(self, watch: Watch) -> None:
+        """A model tripped: it is out, and where it was the live one, the last good one takes over."""
+        del self._weights[watch]
+        self._tripped[watch.name] = watch
         if self._on_trip is not None:
-            self._on_trip(reason)
-        return ZERO
+            self._on_trip(watch.name, watch.reason)
+        if watch is self._last_good:
+            self._last_good = None
+        elif watch is self._live and self._last_good is not None:
+            self.roll_back()
 
     def _slewed(self, wanted: Vector, dt: float) -> Vector:
         (x, y, z), (a, b, c) = self._applied, self.limits.slew
@@ -202,8 +240,3 @@ class Guard:
 def _toward(now: float, wanted: float, step: float, authority: float) -> float:
     wanted = min(authority, max(-authority, wanted))
     return min(now + step, max(now - step, wanted))
-
-
-def _margin(feature: Range, share: float) -> float:
-    floor = _FLOORS.get(feature.unit, 0.1 * max(abs(feature.low), abs(feature.high), 1e-6))
-    return max(share * (feature.high - feature.low), floor)

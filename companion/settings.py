@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 
 from companion.control import Limits
 from companion.flight import Safety
-from companion.guard import GuardLimits
+from companion.shadow import ShadowLimits
+from companion.watch import GuardLimits
 from companion.zenoh_session import ZenohSettings
 from models.errors import InputError
 
@@ -37,6 +38,7 @@ class Settings:
     safety: Safety = field(default_factory=Safety)
     limits: Limits = field(default_factory=Limits)
     guard: GuardLimits = field(default_factory=GuardLimits)
+    shadow: ShadowLimits = field(default_factory=ShadowLimits)
 
     def checked(self) -> Settings:
         """The same, or `InputError` for a value without sense."""

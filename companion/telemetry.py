@@ -6,12 +6,15 @@ Keys are `models.contract.key(vehicle, leaf)`:
 joiners. * `event`: serialised `Event`; reliable, the last ones kept. * `status`: a liveliness token, and a
 query answered with JSON. * `mission`: query with JSON `{"trajectory", "parameters", "controller", "repeat"}`
 or `{"setpoints": CSV, ...}` or `{"command": "abort" | "land"}`. * `model`: query with the bytes of an ONNX
-file, or JSON `{"command": "list" | "rollback"}`. * `record`: query with JSON `{}` for the list, or `{"name",
+file (`model?shadow=SECONDS`: how long to evaluate it in flight before it is applied), or JSON `{"command": "list"
+| "rollback"}`. * `record`: query with JSON `{}` for the list, or `{"name",
 "offset", "length"}` for a piece of one record: its bytes as `application/octet-stream`, with JSON `{"size",
 "offset"}` attached; ask on until `offset` reaches `size`.
 
 Every other answer is JSON with `accepted` and `reason`. Zenoh's callbacks only enqueue. The control thread
-never calls Zenoh: it hands serialised ticks to a publishing thread through a bounded queue and goes on.
+never calls Zenoh: it hands serialised ticks to a publishing thread through a bounded queue and goes on. What
+takes long (the check of a model, pieces of a record) has a thread of its own, so that an order to land never
+waits for it.
 """
 
 from __future__ import annotations
@@ -37,27 +40,33 @@ REQUESTS_WAITING = 64
 PIECE = 1 << 20
 """Greatest number of bytes of a record in one answer."""
 
+_SLOW = ("model", "record")
+
+Handler = Callable[[bytes, dict[str, str]], dict[str, Any]]
+"""From a request's payload and the parameters of its selector to the answer."""
+
 _JSON, _BYTES, _PROTOBUF = "application/json", "application/octet-stream", "application/protobuf"
 
 
 class Telemetry:
-    """Publishes and answers for one vehicle; all handlers run on one service thread.
+    """Publishes and answers for one vehicle; handlers run on two service threads, quick ones and slow ones.
 
-    `handlers` maps the leaves `status`, `mission` and `model` to functions of the request's payload that
-    return the answer. `records` is the folder that `record` serves from.
+    `handlers` maps the leaves `status`, `mission` and `model` to their handlers. `records` is the folder that
+    `record` serves from.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         vehicle: str,
-        handlers: dict[str, Callable[[bytes], dict[str, Any]]],
+        handlers: dict[str, Handler],
         records: Path,
     ) -> None:
         self.ticks_dropped = 0
         self._session, self._records = session, records
         self._handlers = {"record": self._record, **handlers}
-        self._requests: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(REQUESTS_WAITING)
+        self._quick: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(REQUESTS_WAITING)
+        self._slow: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(REQUESTS_WAITING)
         self._ticks: deque[bytes] = deque()
         self._events: deque[bytes] = deque()
         self._wake = threading.Event()
@@ -89,7 +98,8 @@ class Telemetry:
         self._token = session.liveliness().declare_token(contract.key(vehicle, "status"))
         self._threads = [
             threading.Thread(target=self._publish, name="zenoh-publisher", daemon=True),
-            threading.Thread(target=self._serve, name="zenoh-service", daemon=True),
+            threading.Thread(target=self._serve, args=(self._quick,), name="zenoh-service", daemon=True),
+            threading.Thread(target=self._serve, args=(self._slow,), name="zenoh-slow-service", daemon=True),
         ]
         for thread in self._threads:
             thread.start()
@@ -111,8 +121,9 @@ class Telemetry:
         """Publish what waits, say good-bye and close the session."""
         self._closing = True
         self._wake.set()
-        with contextlib.suppress(queue.Full):
-            self._requests.put(None, timeout=1.0)
+        for requests in (self._quick, self._slow):
+            with contextlib.suppress(queue.Full):
+                requests.put(None, timeout=1.0)
         for thread in self._threads:
             thread.join(2.0)
         self._token.undeclare()
@@ -132,27 +143,30 @@ class Telemetry:
                 return
 
     def _enqueuer(self, leaf: str) -> Callable[[zenoh.Query], None]:
+        requests = self._slow if leaf in _SLOW else self._quick
+
         def enqueue(query: zenoh.Query) -> None:
             try:
-                self._requests.put_nowait((leaf, query))
+                requests.put_nowait((leaf, query))
             except queue.Full:
                 _answer(query, {"accepted": False, "reason": "too many requests are waiting; ask again"})
                 query.drop()
 
         return enqueue
 
-    def _serve(self) -> None:
-        while (item := self._requests.get()) is not None:
+    def _serve(self, requests: queue.Queue[tuple[str, zenoh.Query] | None]) -> None:
+        while (item := requests.get()) is not None:
             leaf, query = item
             with query:
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
-                    answer = self._handlers[leaf](payload)
+                    parameters = dict(query.parameters)  # type: ignore[call-overload]
+                    answer = self._handlers[leaf](payload, parameters)
                 except Exception as error:  # noqa: BLE001 - one bad request must not end the service
                     answer = {"accepted": False, "reason": f"internal error: {type(error).__name__}: {error}"}
                 _answer(query, answer)
 
-    def _record(self, payload: bytes) -> dict[str, Any]:
+    def _record(self, payload: bytes, parameters: dict[str, str]) -> dict[str, Any]:
         request = read_json(payload)
         if "name" not in request:
             return {"accepted": True, "reason": "", "records": list_records(self._records)}

@@ -27,7 +27,10 @@ def make_tick(odometry: Odometry, latest: Latest, outcome: Outcome, latency: flo
         latency=latency,
         inference=outcome.inference,
         setpoint_sent=outcome.step is not None,
+        shadow=outcome.shadow,
     )
+    if outcome.shadow:
+        _set(tick.shadow_raw, outcome.shadow_raw)
     _set(tick.position, outcome.position)
     _set(tick.velocity, odometry.velocity)
     _set(tick.angular_velocity, odometry.angular_velocity)

@@ -23,6 +23,8 @@ from models.errors import InputError
 from models.record_pb2 import Event, Tick
 
 PIECE_TRIES = 3
+CHECK_PATIENCE = 40.0
+"""Seconds for the answer to a model: its check may take longer than any other request."""
 
 
 class Link:
@@ -59,11 +61,15 @@ class Link:
         self.session.close()
 
     def ask(
-        self, leaf: str, request: dict[str, Any] | bytes | None = None, timeout: float | None = None
+        self,
+        leaf: str,
+        request: dict[str, Any] | bytes | None = None,
+        timeout: float | None = None,
+        parameters: str = "",
     ) -> dict[str, Any]:
-        """The companion's JSON answer. Raises `InputError` where it is silent or does not answer with
-        JSON."""
-        data, _ = self._reply(leaf, request, timeout)
+        """The companion's JSON answer; `parameters` are those of a Zenoh selector. Raises `InputError` where it is
+        silent or does not answer with JSON."""
+        data, _ = self._reply(leaf, request, timeout, parameters)
         try:
             answer = json.loads(data)
         except ValueError:
@@ -75,10 +81,14 @@ class Link:
         return answer
 
     def request(
-        self, leaf: str, request: dict[str, Any] | bytes, timeout: float | None = None
+        self,
+        leaf: str,
+        request: dict[str, Any] | bytes,
+        timeout: float | None = None,
+        parameters: str = "",
     ) -> dict[str, Any]:
         """As `ask`, but a refusal raises `InputError` with the companion's reason."""
-        answer = self.ask(leaf, request, timeout)
+        answer = self.ask(leaf, request, timeout, parameters)
         if not answer.get("accepted", False):
             raise InputError(f"companion '{self.vehicle}' refused: {answer.get('reason', 'no reason given')}")
         return answer
@@ -86,6 +96,18 @@ class Link:
     def status(self) -> dict[str, Any]:
         """What the companion is doing."""
         return self.ask("status")
+
+    def deploy(self, onnx: bytes, shadow: float | None = None) -> dict[str, Any]:
+        """Send a model; the answer's `state` is `live`, or `shadow` in flight, there for `shadow` s.
+
+        Raises `InputError` where the companion refuses it.
+        """
+        parameters = f"shadow={shadow:g}" if shadow is not None else ""
+        return self.request("model", onnx, max(self.settings.timeout, CHECK_PATIENCE), parameters)
+
+    def roll_back(self) -> dict[str, Any]:
+        """Withdraw the model in the shadow; without one, go back to the model before the live one."""
+        return self.request("model", {"command": "rollback"}, max(self.settings.timeout, CHECK_PATIENCE))
 
     def records(self) -> list[dict[str, Any]]:
         """Flight records on board, oldest first: name, size in bytes, time."""
@@ -170,11 +192,16 @@ class Link:
         raise InputError(f"no {what} answers on {self._where}{others} (other endpoint: -e tcp/HOST:PORT)")
 
     def _reply(
-        self, leaf: str, request: dict[str, Any] | bytes | None, timeout: float | None
+        self,
+        leaf: str,
+        request: dict[str, Any] | bytes | None,
+        timeout: float | None,
+        parameters: str = "",
     ) -> tuple[bytes, dict[str, Any]]:
         payload = json.dumps(request) if isinstance(request, dict) else request
         seconds = timeout if timeout is not None else self.settings.timeout
-        replies = self.session.get(key(self.vehicle, leaf), payload=payload, timeout=seconds)
+        selector = key(self.vehicle, leaf) + (f"?{parameters}" if parameters else "")
+        replies = self.session.get(selector, payload=payload, timeout=seconds)
         for reply in replies:
             if reply.ok is not None:
                 attached = reply.ok.attachment

@@ -51,7 +51,11 @@ def register(app: typer.Typer) -> None:
     app.command(
         "fly", epilog="Example: groundstation fly lemniscate --set speed=2 --controller corrected --wait"
     )(fly_command)
-    app.command("deploy", epilog="Example: groundstation deploy quad5-v3.onnx")(deploy_command)
+    app.command(
+        "deploy",
+        epilog="Example: groundstation deploy quad5-v3.onnx --shadow 5 --wait, and to take it back: "
+        "groundstation deploy --roll-back",
+    )(deploy_command)
     app.command("status", epilog="Example: groundstation status -e tcp/192.168.1.7:7447 --json")(
         status_command
     )
@@ -276,7 +280,19 @@ def _fetch(link: Link, record: str, folder: Path, quiet: bool) -> Path:
 
 
 def deploy_command(
-    model: Annotated[Path, typer.Argument(help="ONNX file of `groundstation model export`.")],
+    model: Annotated[
+        Path | None, typer.Argument(help="ONNX file of `groundstation model export`.", show_default=False)
+    ] = None,
+    shadow: Annotated[
+        float | None,
+        typer.Option(help="In flight: seconds to evaluate it before it is applied.", min=0.5, max=600.0),
+    ] = None,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="In flight: follow it until it is live or refused.")
+    ] = False,
+    roll_back: Annotated[
+        bool, typer.Option("--roll-back", help="Go back to the model before the live one, also in flight.")
+    ] = False,
     config: ConfigOption = None,
     name: NameOption = None,
     connect: ConnectOption = None,
@@ -287,10 +303,56 @@ def deploy_command(
     timeout: TimeoutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Send a model to the companion, which checks it and makes it live, or says why not."""
+    """Send a model to the companion, which checks it and makes it live, or says why not.
+
+    In flight it is evaluated beside the live one first, and takes over only where it predicts no worse than the
+    plain linear model. With --roll-back a model in the shadow is withdrawn; without one, the previous model
+    becomes live again.
+    """
     from groundstation.link import Link
+
+    if roll_back and (model is not None or shadow is not None):
+        raise InputError("--roll-back goes back to the previous model; leave the file and --shadow out")
+    onnx = b"" if roll_back else _read_onnx(model)
+    settings = _settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
+    with Link(settings) as link:
+        vehicle = link.vehicle
+        events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        if roll_back:
+            result = {"vehicle": vehicle, **link.roll_back()}
+        else:
+            if wait:
+                link.follow(on_event=events.put)
+            result = {"hash": _hash(onnx), "vehicle": vehicle, **link.deploy(onnx, shadow)}
+            if wait and result.get("state") == "shadow":
+                result |= _follow_candidate(link, result["hash"], events, as_json)
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    if roll_back:
+        console.print(escape(f"'{vehicle}': {result['reason']}"), highlight=False)
+        return
+    assert model is not None
+    states = {
+        "live": "is live as",
+        "shadow": "is in the shadow as",
+        "staged": "has not proved itself before landing, and waits for the next corrected flight, as",
+    }
+    what = states.get(str(result.get("state", "live")), "is there as")
+    console.print(escape(f"accepted by '{vehicle}': {model.name} {what} {result['hash']}"), highlight=False)
+    if result.get("reason"):
+        console.print(escape(str(result["reason"])))
+
+
+def _hash(onnx: bytes) -> str:
     from models.contract import model_hash
 
+    return model_hash(onnx)
+
+
+def _read_onnx(model: Path | None) -> bytes:
+    if model is None:
+        raise InputError("which model? Pass the file that `groundstation model export` wrote, or --roll-back")
     try:
         onnx = model.read_bytes()
     except OSError as error:
@@ -299,18 +361,58 @@ def deploy_command(
         ) from None
     if not onnx or onnx[:1] == b"{":
         raise InputError(f"{model}: not an ONNX file; pass the one that `groundstation model export` wrote")
-    settings = _settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
-    with Link(settings) as link:
-        answer = link.request("model", onnx, max(settings.timeout, 30.0))
-        vehicle = link.vehicle
-    if as_json:
-        typer.echo(json.dumps({"hash": model_hash(onnx), "vehicle": vehicle, **answer}))
-        return
-    console.print(
-        f"accepted by '{vehicle}': {escape(model.name)} is live as {model_hash(onnx)}", highlight=False
-    )
-    if answer.get("reason"):
-        console.print(escape(str(answer["reason"])))
+    return onnx
+
+
+def _follow_candidate(
+    link: Link, model: str, events: queue.SimpleQueue[Event], quiet: bool
+) -> dict[str, Any]:
+    """Follow a model from the shadow to its end: the `state` it came to. Raises `InputError` where refused."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    told: list[Event] = []
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(
+        *columns, console=console, transient=True, disable=quiet or not console.is_terminal
+    ) as progress:
+        task = progress.add_task(f"{model} in the shadow", total=None)
+        missed = 0
+        while True:
+            time.sleep(0.1)
+            try:
+                status = link.status()
+                missed = 0
+            except InputError:  # a link may drop for a while in flight; the flight goes on without it
+                missed += 1
+                if missed > 5:
+                    raise
+                continue
+            while not events.empty():
+                event = events.get()
+                told.append(event)
+                if not quiet:
+                    progress.console.print(
+                        f"{event.kind}: {escape(event.text)}", style=STYLES.get(event.level, "")
+                    )
+            about = status.get("shadow") or {}
+            if about.get("hash") == model:
+                left = float(about["remaining"])
+                seconds = max(left, progress.tasks[task].total or 0.0)
+                progress.update(task, total=seconds, completed=seconds - left)
+                continue
+            own = [event for event in told if model in event.text]
+            outcome = next((e for e in own if e.kind in ("model_live", "model_refused")), None)
+            if outcome is not None and outcome.kind == "model_refused":
+                raise InputError(f"companion '{link.vehicle}' refused: {outcome.text}")
+            if status["live"] == model:
+                return {"state": "live", "reason": outcome.text if outcome is not None else ""}
+            if status["phase"] == "idle":
+                waits = (status.get("staged") or {}).get("hash") == model
+                if not waits:
+                    raise InputError(
+                        f"companion '{link.vehicle}' does not have {model} any more; see its events"
+                    )
+                return {"state": "staged", "reason": own[-1].text if own else ""}
 
 
 def status_command(
@@ -342,7 +444,15 @@ def status_command(
         else f"[yellow]{escape(status['not_ready'])}[/yellow]"
     )
     rates = ", ".join(f"{key} {value:.0f} Hz" for key, value in status.get("rates", {}).items())
-    live = status.get("live") or status.get("model") or ""
+    titles = {
+        entry["hash"]: f"{entry['hash']} ({entry['name']} {entry['version']})" for entry in status["models"]
+    }
+    shadow, staged = status["shadow"], status["staged"]
+    waiting = ""
+    if shadow:
+        waiting = f"{shadow['title']}, {shadow['remaining']:.1f} s to go"
+    elif staged:
+        waiting = f"{staged['hash']} ({staged['name']} {staged['version']}), not judged yet"
     for what, value in (
         ("vehicle", f"{escape(status['vehicle'])}: {ready}"),
         (
@@ -352,7 +462,9 @@ def status_command(
         ),
         ("battery", f"{status['battery_voltage']:.2f} V"),
         ("received", rates or "not measured"),
-        ("live model", escape(live if isinstance(live, str) else str(live.get("hash", live)))),
+        ("live model", escape(titles.get(status["live"], status["live"]))),
+        ("in the shadow", escape(waiting)),
+        ("last good", escape(titles.get(status["last_good"], status["last_good"]))),
         ("guard", escape(status["guard"])),
         ("records", f"{len(records)} on board"),
     ):

@@ -191,7 +191,9 @@ class FlightRecord:
     vehicle's clock since the first tick), `vehicle_time` and `host_time` (s), `feedback_thrust` (N),
     `feedback_body_rate` (rad/s), `correction`, `correction_raw` (m/s², heading frame), `interval`, `latency`,
     `inference` (s), `setpoint_sent`, `armed` (bool) and the words `model`, `controller`, `flight_mode`,
-    `phase`, `guard`, `trajectory`. What was never known is absent; what is missing in a tick is NaN.
+    `phase`, `guard`, `trajectory`, `shadow` (hash of a model evaluated but not applied), with `shadow_raw`
+    (m/s², heading frame) for what that returned. What was never known is absent; what is missing in a tick is
+    NaN.
     `truncated` tells that the file has no proper end, `notes` what that and any drops mean.
     """
 
@@ -323,6 +325,7 @@ _SCALARS = {
     "phase": str,
     "guard": str,
     "trajectory": str,
+    "shadow": str,
 }
 _VECTORS = (
     "position",
@@ -335,6 +338,7 @@ _VECTORS = (
     "correction",
     "correction_raw",
     "body_rate_command",
+    "shadow_raw",
 )
 
 
@@ -357,7 +361,7 @@ def tick_columns(ticks: Iterable[Tick]) -> dict[str, np.ndarray]:
         [tuple(t.rotor_speed)[:4] if len(t.rotor_speed) >= 4 else (np.nan,) * 4 for t in ticks], dtype=float
     ).reshape(-1, 4)
     columns["battery_voltage"][columns["battery_voltage"] == 0.0] = np.nan
-    for name in ("specific_force", "rotor_speed", "battery_voltage", "position_reference"):
+    for name in ("specific_force", "rotor_speed", "battery_voltage", "position_reference", "shadow_raw"):
         if not np.any(np.isfinite(columns[name])):
             del columns[name]
     vehicle_time = np.array([tick.vehicle_time_us for tick in ticks], dtype=np.int64)

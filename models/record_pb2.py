@@ -4,38 +4,41 @@
 # source: models/record.proto
 # Protobuf Python Version: 7.35.1
 """Generated protocol buffer code."""
-
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import descriptor_pool as _descriptor_pool
 from google.protobuf import runtime_version as _runtime_version
 from google.protobuf import symbol_database as _symbol_database
 from google.protobuf.internal import builder as _builder
-
 _runtime_version.ValidateProtobufRuntimeVersion(
-    _runtime_version.Domain.PUBLIC, 7, 35, 1, "", "models/record.proto"
+    _runtime_version.Domain.PUBLIC,
+    7,
+    35,
+    1,
+    '',
+    'models/record.proto'
 )
 # @@protoc_insertion_point(imports)
 
 _sym_db = _symbol_database.Default()
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(
-    b'\n\x13models/record.proto\x12\ntrueflight"*\n\x07Vector3\x12\t\n\x01x\x18\x01 \x01(\x01\x12\t\n\x01y\x18\x02 \x01(\x01\x12\t\n\x01z\x18\x03 \x01(\x01"8\n\nQuaternion\x12\t\n\x01w\x18\x01 \x01(\x01\x12\t\n\x01x\x18\x02 \x01(\x01\x12\t\n\x01y\x18\x03 \x01(\x01\x12\t\n\x01z\x18\x04 \x01(\x01"A\n\x07\x43ommand\x12\x0e\n\x06thrust\x18\x01 \x01(\x01\x12&\n\tbody_rate\x18\x02 \x01(\x0b\x32\x13.trueflight.Vector3"\xf2\x06\n\x04Tick\x12\x17\n\x0fvehicle_time_us\x18\x01 \x01(\x03\x12\x14\n\x0chost_time_ns\x18\x02 \x01(\x03\x12%\n\x08position\x18\x03 \x01(\x0b\x32\x13.trueflight.Vector3\x12%\n\x08velocity\x18\x04 \x01(\x0b\x32\x13.trueflight.Vector3\x12*\n\nquaternion\x18\x05 \x01(\x0b\x32\x16.trueflight.Quaternion\x12-\n\x10\x61ngular_velocity\x18\x06 \x01(\x0b\x32\x13.trueflight.Vector3\x12+\n\x0especific_force\x18\x07 \x01(\x0b\x32\x13.trueflight.Vector3\x12/\n\x12position_reference\x18\x08 \x01(\x0b\x32\x13.trueflight.Vector3\x12/\n\x12velocity_reference\x18\t \x01(\x0b\x32\x13.trueflight.Vector3\x12\x33\n\x16\x61\x63\x63\x65leration_reference\x18\n \x01(\x0b\x32\x13.trueflight.Vector3\x12\x15\n\ryaw_reference\x18\x0b \x01(\x01\x12%\n\x08\x66\x65\x65\x64\x62\x61\x63k\x18\x0c \x01(\x0b\x32\x13.trueflight.Command\x12\'\n\ncorrection\x18\r \x01(\x0b\x32\x13.trueflight.Vector3\x12+\n\x0e\x63orrection_raw\x18\x0e \x01(\x0b\x32\x13.trueflight.Vector3\x12\x16\n\x0ethrust_command\x18\x0f \x01(\x01\x12.\n\x11\x62ody_rate_command\x18\x10 \x01(\x0b\x32\x13.trueflight.Vector3\x12\x17\n\x0f\x62\x61ttery_voltage\x18\x11 \x01(\x01\x12\x13\n\x0brotor_speed\x18\x12 \x03(\x01\x12\r\n\x05model\x18\x13 \x01(\t\x12\x12\n\ncontroller\x18\x14 \x01(\t\x12\x13\n\x0b\x66light_mode\x18\x15 \x01(\t\x12\r\n\x05\x61rmed\x18\x16 \x01(\x08\x12\r\n\x05phase\x18\x17 \x01(\t\x12\r\n\x05guard\x18\x18 \x01(\t\x12\x10\n\x08interval\x18\x19 \x01(\x01\x12\x0f\n\x07latency\x18\x1a \x01(\x01\x12\x11\n\tinference\x18\x1b \x01(\x01\x12\x15\n\rsetpoint_sent\x18\x1c \x01(\x08\x12\x12\n\ntrajectory\x18\x1d \x01(\t"a\n\x05\x45vent\x12\x17\n\x0fvehicle_time_us\x18\x01 \x01(\x03\x12\x14\n\x0chost_time_ns\x18\x02 \x01(\x03\x12\r\n\x05level\x18\x03 \x01(\t\x12\x0c\n\x04kind\x18\x04 \x01(\t\x12\x0c\n\x04text\x18\x05 \x01(\tb\x06proto3'
-)
+
+
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x13models/record.proto\x12\ntrueflight\"*\n\x07Vector3\x12\t\n\x01x\x18\x01 \x01(\x01\x12\t\n\x01y\x18\x02 \x01(\x01\x12\t\n\x01z\x18\x03 \x01(\x01\"8\n\nQuaternion\x12\t\n\x01w\x18\x01 \x01(\x01\x12\t\n\x01x\x18\x02 \x01(\x01\x12\t\n\x01y\x18\x03 \x01(\x01\x12\t\n\x01z\x18\x04 \x01(\x01\"A\n\x07\x43ommand\x12\x0e\n\x06thrust\x18\x01 \x01(\x01\x12&\n\tbody_rate\x18\x02 \x01(\x0b\x32\x13.trueflight.Vector3\"\xab\x07\n\x04Tick\x12\x17\n\x0fvehicle_time_us\x18\x01 \x01(\x03\x12\x14\n\x0chost_time_ns\x18\x02 \x01(\x03\x12%\n\x08position\x18\x03 \x01(\x0b\x32\x13.trueflight.Vector3\x12%\n\x08velocity\x18\x04 \x01(\x0b\x32\x13.trueflight.Vector3\x12*\n\nquaternion\x18\x05 \x01(\x0b\x32\x16.trueflight.Quaternion\x12-\n\x10\x61ngular_velocity\x18\x06 \x01(\x0b\x32\x13.trueflight.Vector3\x12+\n\x0especific_force\x18\x07 \x01(\x0b\x32\x13.trueflight.Vector3\x12/\n\x12position_reference\x18\x08 \x01(\x0b\x32\x13.trueflight.Vector3\x12/\n\x12velocity_reference\x18\t \x01(\x0b\x32\x13.trueflight.Vector3\x12\x33\n\x16\x61\x63\x63\x65leration_reference\x18\n \x01(\x0b\x32\x13.trueflight.Vector3\x12\x15\n\ryaw_reference\x18\x0b \x01(\x01\x12%\n\x08\x66\x65\x65\x64\x62\x61\x63k\x18\x0c \x01(\x0b\x32\x13.trueflight.Command\x12\'\n\ncorrection\x18\r \x01(\x0b\x32\x13.trueflight.Vector3\x12+\n\x0e\x63orrection_raw\x18\x0e \x01(\x0b\x32\x13.trueflight.Vector3\x12\x16\n\x0ethrust_command\x18\x0f \x01(\x01\x12.\n\x11\x62ody_rate_command\x18\x10 \x01(\x0b\x32\x13.trueflight.Vector3\x12\x17\n\x0f\x62\x61ttery_voltage\x18\x11 \x01(\x01\x12\x13\n\x0brotor_speed\x18\x12 \x03(\x01\x12\r\n\x05model\x18\x13 \x01(\t\x12\x12\n\ncontroller\x18\x14 \x01(\t\x12\x13\n\x0b\x66light_mode\x18\x15 \x01(\t\x12\r\n\x05\x61rmed\x18\x16 \x01(\x08\x12\r\n\x05phase\x18\x17 \x01(\t\x12\r\n\x05guard\x18\x18 \x01(\t\x12\x10\n\x08interval\x18\x19 \x01(\x01\x12\x0f\n\x07latency\x18\x1a \x01(\x01\x12\x11\n\tinference\x18\x1b \x01(\x01\x12\x15\n\rsetpoint_sent\x18\x1c \x01(\x08\x12\x12\n\ntrajectory\x18\x1d \x01(\t\x12\x0e\n\x06shadow\x18\x1e \x01(\t\x12\'\n\nshadow_raw\x18\x1f \x01(\x0b\x32\x13.trueflight.Vector3\"a\n\x05\x45vent\x12\x17\n\x0fvehicle_time_us\x18\x01 \x01(\x03\x12\x14\n\x0chost_time_ns\x18\x02 \x01(\x03\x12\r\n\x05level\x18\x03 \x01(\t\x12\x0c\n\x04kind\x18\x04 \x01(\t\x12\x0c\n\x04text\x18\x05 \x01(\tb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
-_builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, "models.record_pb2", _globals)
+_builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'models.record_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
-    DESCRIPTOR._loaded_options = None
-    _globals["_VECTOR3"]._serialized_start = 35
-    _globals["_VECTOR3"]._serialized_end = 77
-    _globals["_QUATERNION"]._serialized_start = 79
-    _globals["_QUATERNION"]._serialized_end = 135
-    _globals["_COMMAND"]._serialized_start = 137
-    _globals["_COMMAND"]._serialized_end = 202
-    _globals["_TICK"]._serialized_start = 205
-    _globals["_TICK"]._serialized_end = 1087
-    _globals["_EVENT"]._serialized_start = 1089
-    _globals["_EVENT"]._serialized_end = 1186
+  DESCRIPTOR._loaded_options = None
+  _globals['_VECTOR3']._serialized_start=35
+  _globals['_VECTOR3']._serialized_end=77
+  _globals['_QUATERNION']._serialized_start=79
+  _globals['_QUATERNION']._serialized_end=135
+  _globals['_COMMAND']._serialized_start=137
+  _globals['_COMMAND']._serialized_end=202
+  _globals['_TICK']._serialized_start=205
+  _globals['_TICK']._serialized_end=1144
+  _globals['_EVENT']._serialized_start=1146
+  _globals['_EVENT']._serialized_end=1243
 # @@protoc_insertion_point(module_scope)

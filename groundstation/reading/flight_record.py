@@ -32,8 +32,10 @@ def read_flight_record(path: Path, vehicle: str | Path | Vehicle | None = None) 
     """The flight of a record. The vehicle is that of the record unless one is given.
 
     Only what the companion itself commanded, in the air, counts as flying. Words of each tick stand as
-    numbers in `extra`: `mission` (1 while the trajectory was flown) and `corrected` (1 while the guard let a
-    correction act). Raises `InputError` for a record without a vehicle, a flight, or any plausible column.
+    numbers in `extra`: `mission` (1 while the trajectory was flown), `corrected` (1 while the guard let a
+    correction act) and, where a model was evaluated without being applied, `shadow` (1 meanwhile) with
+    `shadow_raw` (m/s², heading frame; 0 elsewhere). Raises `InputError` for a record without a vehicle, a
+    flight, or any plausible column.
     """
     from groundstation.reading.flight_file import assemble
 
@@ -55,6 +57,9 @@ def read_flight_record(path: Path, vehicle: str | Path | Vehicle | None = None) 
     extra["corrected"] = np.array(
         [not word.startswith(("off", "tripped")) for word in ticks["guard"]], dtype=float
     )
+    if "shadow_raw" in ticks:
+        extra["shadow"] = (ticks["shadow"] != "").astype(float)
+        extra["shadow_raw"] = np.nan_to_num(ticks["shadow_raw"])
     extra["commanded"] = commanded.astype(float)
     t = ticks["t"]
     if not np.any(commanded):

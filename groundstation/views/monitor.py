@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import time
 from collections import deque
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -21,6 +23,7 @@ from models.vehicle import Vehicle
 
 PERIOD = 0.1  # s between two updates of the picture
 TRAIL = 30.0  # s of path that stay in sight
+ASK = 1.0  # s between two questions for the names of models, while connected
 WINDOW = 20.0  # s of the curves
 HISTORY = 200  # ticks of the past that are asked for
 SILENCE = 2.0  # s without a tick that the pilot is told of
@@ -42,6 +45,9 @@ CURVES: tuple[tuple[str, str, Colour], ...] = (
     ("correction/x", "x", AXES[0]),
     ("correction/y", "y", AXES[1]),
     ("correction/z", "z", AXES[2]),
+    ("correction/shadow/x", "in the shadow, x", AXES[0]),
+    ("correction/shadow/y", "in the shadow, y", AXES[1]),
+    ("correction/shadow/z", "in the shadow, z", AXES[2]),
     ("latency/setpoint", "odometry to setpoint", NEWEST),
     ("latency/inference", "model", WARNING),
     ("battery/voltage", "battery", MEASURED),
@@ -80,10 +86,12 @@ class Monitor:
         self._last: Tick | None = None
         self._heard = time.monotonic()
         self._told = ""
+        self._models: dict[str, Any] = {}
         stream.send_blueprint(blueprint())
         stream.log("space", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for path, name, colour in CURVES:
-            stream.log(path, rr.SeriesLines(colors=[colour], names=name, widths=[2.0]), static=True)
+            width = 1.0 if "shadow" in path else 2.0
+            stream.log(path, rr.SeriesLines(colors=[colour], names=name, widths=[width]), static=True)
         drawn = Vehicle(name=vehicle, mass=1.0, hover_thrust=0.5, rotor_radius=0.07)
         scene.log_vehicle(stream, "space/vehicle", drawn, 5.0)
 
@@ -91,9 +99,14 @@ class Monitor:
         """Follow `link` until interrupted or for `seconds`; returns how many ticks were seen."""
         link.follow(self._ticks.put, self._events.put, history=HISTORY)
         end = time.monotonic() + seconds if seconds is not None else np.inf
+        asked = -np.inf
         try:
             while time.monotonic() < end:
                 time.sleep(PERIOD)
+                if time.monotonic() - asked > ASK and time.monotonic() - self._heard < SILENCE:
+                    asked = time.monotonic()
+                    with contextlib.suppress(InputError):  # the link may drop; ticks say the rest
+                        self._models = link.ask("status", timeout=ASK)
                 self.update()
         except KeyboardInterrupt:
             pass
@@ -151,20 +164,25 @@ class Monitor:
     def _tell(self) -> None:
         """What the pilot reads first, only when it has changed."""
         silent = time.monotonic() - self._heard
-        said = state(self.vehicle, self._last, silent if silent > SILENCE else 0.0)
+        said = state(self.vehicle, self._last, silent if silent > SILENCE else 0.0, self._models)
         if said != self._told:
             self._told = said
             text(self.stream, "state", said)
 
 
-def state(vehicle: str, tick: Tick | None, silent: float) -> str:
-    """The pilot's page: mode, phase, controller and model, guard, battery, in a few words."""
+def state(vehicle: str, tick: Tick | None, silent: float, models: dict[str, Any] | None = None) -> str:
+    """The pilot's page: mode, phase, controller and models, guard, battery, in a few words.
+
+    `models` is the companion's status: names, last good model, time that is left in the shadow.
+    """
     if tick is None:
         return f"## {vehicle}\n\nNo tick has arrived yet."
     head = f"## {vehicle}: {tick.phase or 'idle'}"
     if silent:
         head = f"## {vehicle}: SILENT for {silent:.0f} s"
     guard = tick.guard or "off"
+    known = models or {}
+    names = {entry["hash"]: f"{entry['name']} {entry['version']}" for entry in known.get("models", [])}
     lines = [
         head,
         "",
@@ -173,13 +191,33 @@ def state(vehicle: str, tick: Tick | None, silent: float) -> str:
         f"| mode | **{tick.flight_mode or 'unknown'}**, {'armed' if tick.armed else 'disarmed'} |",
         f"| flying | {tick.trajectory or 'nothing'} |",
         f"| controller | **{tick.controller or 'none'}** |",
-        f"| model | {f'`{tick.model}`' if tick.model else 'none'} |",
+        f"| live model | {_called(tick.model, names)} |",
+    ]
+    if tick.shadow:
+        about = known.get("shadow") or {}
+        same = about.get("hash") == tick.shadow
+        left = f", {about['remaining']:.0f} s to go" if same else ""
+        lines.append(
+            f"| in the shadow | {_called(tick.shadow, {tick.shadow: _bare(about) if same else ''})}{left} |"
+        )
+    if known.get("last_good"):
+        lines.append(f"| last good | {_called(known['last_good'], names)} |")
+    lines += [
         f"| guard | {f'**{guard}**' if guard.startswith('tripped') else guard} |",
         f"| battery | {tick.battery_voltage:.1f} V |",
         f"| height | {tick.position.z:.1f} m |",
         f"| latency | {1e3 * tick.latency:.1f} ms |",
     ]
     return "\n".join(lines)
+
+
+def _called(model: str, names: dict[str, str]) -> str:
+    return f"`{model}` {names.get(model, '')}".rstrip() if model else "none"
+
+
+def _bare(about: dict[str, Any]) -> str:
+    """Name and version of a title `HASH (NAME VERSION)`."""
+    return str(about.get("title", "")).partition("(")[2].rstrip(")")
 
 
 def blueprint() -> rrb.Blueprint:
@@ -226,7 +264,7 @@ def blueprint() -> rrb.Blueprint:
                     curves("thrust/sent", "thrust sent (1 is full)"),
                 ),
                 curves("rates", "body rates sent (deg/s): roll red, pitch green, yaw blue"),
-                curves("correction", "correction (m/s²): x red, y green, z blue"),
+                curves("correction", "correction (m/s²): x red, y green, z blue; thin: in the shadow"),
                 rrb.Horizontal(
                     curves("latency", "latency (ms), model orange"),
                     curves("battery", "battery (V)"),
@@ -247,11 +285,13 @@ def _columns(ticks: list[Tick]) -> dict[str, np.ndarray]:
         [_xyz(t.position_reference) if t.HasField("position_reference") else (np.nan,) * 3 for t in ticks]
     )
     correction = np.array([_xyz(t.correction) for t in ticks])
+    shadow = np.array([_xyz(t.shadow_raw) if t.shadow else (np.nan,) * 3 for t in ticks])
     rates = np.degrees([_xyz(t.body_rate_command) for t in ticks])
     for axis, name in enumerate("xyz"):
         out[f"position/{name}/flown"] = flown[:, axis]
         out[f"position/{name}/reference"] = wanted[:, axis]
         out[f"correction/{name}"] = correction[:, axis]
+        out[f"correction/shadow/{name}"] = shadow[:, axis]
     for axis, name in enumerate(("roll", "pitch", "yaw")):
         out[f"rates/{name}"] = rates[:, axis]
     out["thrust/sent"] = np.array([t.thrust_command for t in ticks])

@@ -272,9 +272,9 @@ def test_cancelled_before_takeoff_it_streams_no_more() -> None:
 
 def test_the_correction_is_on_in_the_mission_only() -> None:
     ranges = [Range(name, unit, -100.0, 100.0) for name, unit in FEATURES.items()]
-    guard = Guard(lambda features: (1.0, 0.0, 0.0), ranges)
+    guard = Guard(lambda features: (1.0, 0.0, 0.0), ranges, name="abc")
     rig = Rig()
-    rig.take_off(Mission("m1", trajectory("hover", duration=6.0), "corrected", 1, guard, "abc"))
+    rig.take_off(Mission("m1", trajectory("hover", duration=6.0), "corrected", 1, guard))
     for out in rig.until(MISSION)[:-1]:
         assert out.step is not None
         assert out.step.correction == (0.0, 0.0, 0.0)

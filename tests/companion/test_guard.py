@@ -29,7 +29,7 @@ class Clock:
 
 def guard_of(model, limits=LIMITS, trips=None, clock=None) -> Guard:
     kwargs = {} if clock is None else {"clock": clock}
-    return Guard(model, RANGES, limits, on_trip=None if trips is None else trips.append, **kwargs)
+    return Guard(model, RANGES, limits, on_trip=None if trips is None else lambda name, why: trips.append(why), **kwargs)
 
 
 def run(guard: Guard, seconds: float, features=INSIDE) -> list[tuple[float, float, float]]:

@@ -43,13 +43,13 @@ def served(endpoint, tmp_path):
     """The companion's telemetry with a vehicle that refuses what it does not know; no autopilot behind it."""
     asked: list[tuple[str, bytes]] = []
 
-    def mission(payload):
+    def mission(payload, parameters):
         asked.append(("mission", payload))
         if read_json(payload).get("trajectory") == "hover":
             return {"accepted": True, "reason": "next", "mission": "m1", "duration": 10.0}
         return {"accepted": False, "reason": "the battery has 14.1 V, a flight needs 14.4 V"}
 
-    def model(payload):
+    def model(payload, parameters):
         asked.append(("model", payload))
         return {"accepted": False, "reason": "made for vehicle 'x500', this is 'quad5'"}
 
@@ -58,7 +58,11 @@ def served(endpoint, tmp_path):
     telemetry = Telemetry(
         open_session(ZenohSettings(listen=(endpoint,))),
         "quad5",
-        {"status": lambda payload: {"accepted": True, "phase": "idle"}, "mission": mission, "model": model},
+        {
+            "status": lambda payload, parameters: {"accepted": True, "phase": "idle"},
+            "mission": mission,
+            "model": model,
+        },
         records,
     )
     telemetry.asked = asked

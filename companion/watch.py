@@ -1,0 +1,184 @@
+"""A watch over one learned model: what it may say, how long it may take, and where it may be believed.
+
+It believes nothing about the model. Whatever that returns (NaN, infinity, huge numbers), however long it
+takes, or if it raises: what comes out is finite and within an authority per axis. Anything that cannot be
+right trips. A trip latches: the model is not called again.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from companion.actuation import ACTS_AT_ONCE, Actuation
+
+Vector = tuple[float, float, float]
+ZERO: Vector = (0.0, 0.0, 0.0)
+
+_FLOORS = {"m": 0.2, "m/s": 0.5, "V": 0.5, "1": 0.1}
+"""Least margin around the training range, by unit: noise and trim, where training hardly moved a feature."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """The range of one feature seen in training, in `unit`."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class GuardLimits:
+    """How far a correction is trusted.
+
+    `authority` m/s² and `slew` m/s³ per axis of the heading frame. A raw value beyond `absurd` times the
+    authority trips; one beyond the authority is cut and trips after `patience` s without a pause. Outside the
+    training range the correction is scaled down, to nothing at `margin` times the range's width, and trips
+    after `patience` s beyond. `deadline` s for one inference: `misses` late ones in a row trip, as does a single
+    one of more than `stall` s. One late inference alone says more of the operating system than of the model.
+    `fade` s from nothing to full effect and back, and from one model to another.
+    """
+
+    authority: Vector = (3.0, 3.0, 4.0)
+    slew: Vector = (30.0, 30.0, 40.0)
+    absurd: float = 5.0
+    margin: float = 0.25
+    patience: float = 1.0
+    deadline: float = 0.002
+    misses: int = 5
+    stall: float = 0.05
+    fade: float = 1.0
+
+
+class Look(NamedTuple):
+    """What a model says: `raw` as it returned it, `wanted` what of it may act (m/s²), `rate` of x and y (m/s³)."""
+
+    raw: Vector
+    wanted: Vector
+    rate: tuple[float, float]
+
+
+class Watch:
+    """One model during one flight.
+
+    `model` maps features to three error accelerations (m/s², heading frame). `ranges` are the features'
+    training ranges in the model's order. `name` is the model's hash, `actuation` what it knows
+    of the path from command to motion. `clock` is for tests.
+    """
+
+    def __init__(
+        self,
+        model: Callable[[Sequence[float]], Sequence[float]],
+        ranges: Sequence[Range],
+        limits: GuardLimits | None = None,
+        wants_yaw: bool = False,
+        name: str = "",
+        clock: Callable[[], float] = time.perf_counter,
+        actuation: Actuation = ACTS_AT_ONCE,
+    ) -> None:
+        self.name, self.wants_yaw, self.actuation = name, wants_yaw, actuation
+        self.limits = limits if limits is not None else GuardLimits()
+        self.reason = ""
+        """Why it tripped; empty while it has not."""
+        self.trust = 0.0
+        """Share of the last answer that was believed: 1 in the training range, 0 well outside."""
+        self.inference_time = 0.0
+        """Seconds that the last call of the model took."""
+        self._model = model
+        self._ranges = [(r.name, r.low, r.high, _margin(r, self.limits.margin)) for r in ranges]
+        self._clock = clock
+        self._late = 0
+        self._outside = self._saturated = 0.0
+
+    @property
+    def tripped(self) -> bool:
+        """Whether it gave up on this model for the rest of the flight."""
+        return self.reason != ""
+
+    def evaluate(self, features: Sequence[float], dt: float) -> tuple[Vector, Vector]:
+        """The model's raw answer, and what of it may act: finite and within the authority; m/s², heading frame.
+
+        `features` may be longer than the model's: those come first. `dt` s since the last call, finite and not
+        negative. After a trip both are zero and the model is not called.
+        """
+        self.inference_time = 0.0
+        if self.reason:
+            return ZERO, ZERO
+        features = features[: len(self._ranges)]
+        begin = self._clock()
+        try:
+            x, y, z = self._model(features)
+            raw = (float(x), float(y), float(z))
+        except Exception as error:  # noqa: BLE001 - whatever a model raises, the flight goes on without it
+            return self.trip(f"the model raised {type(error).__name__}"), ZERO
+        self.inference_time = self._clock() - begin
+        if not (math.isfinite(raw[0]) and math.isfinite(raw[1]) and math.isfinite(raw[2])):
+            return self.trip("the model returned a number that is not finite"), ZERO
+        if not self._in_time(self.inference_time):
+            return raw, self.trip(f"inference took {1e3 * self.inference_time:.1f} ms")
+        a, b, c = self.limits.authority
+        excess = max(abs(raw[0]) / a, abs(raw[1]) / b, abs(raw[2]) / c)
+        if excess > self.limits.absurd:
+            return raw, self.trip(f"a correction {excess:.0f} times its authority")
+        self._saturated = self._saturated + dt if excess > 1.0 else 0.0
+        if self._saturated > self.limits.patience:
+            return raw, self.trip(f"beyond its authority for {self.limits.patience:g} s")
+        trust, name = self._trusted(features)
+        self.trust = trust
+        self._outside = self._outside + dt if trust == 0.0 else 0.0
+        if self._outside > self.limits.patience:
+            return raw, self.trip(f"{name} outside its training range for {self.limits.patience:g} s")
+        return raw, (trust * _within(raw[0], a), trust * _within(raw[1], b), trust * _within(raw[2], c))
+
+    def look(self, rows: Sequence[Sequence[float]], ahead: float, dt: float) -> Look:
+        """What the model says for three rows of features: where tilt acts, `ahead` s later, where thrust acts.
+
+        x and y are taken from the first row, z from the third, the rate from the first two.
+        """
+        raw, now = self.evaluate(rows[0], dt)
+        trust, seconds = self.trust, self.inference_time
+        _, later = self.evaluate(rows[1], 0.0)
+        seconds += self.inference_time
+        lifting, lifted = self.evaluate(rows[2], 0.0)
+        self.inference_time += seconds
+        if self.reason:
+            return Look((raw[0], raw[1], lifting[2]), ZERO, (0.0, 0.0))
+        self.trust = min(trust, self.trust)
+        rate = ((later[0] - now[0]) / ahead, (later[1] - now[1]) / ahead)
+        return Look((raw[0], raw[1], lifting[2]), (now[0], now[1], lifted[2]), rate)
+
+    def trip(self, reason: str) -> Vector:
+        """Give up on the model for `reason`; what may act from now on: nothing."""
+        self.reason, self.trust = reason, 0.0
+        return ZERO
+
+    def _in_time(self, seconds: float) -> bool:
+        self._late = self._late + 1 if seconds > self.limits.deadline else 0
+        return self._late < self.limits.misses and seconds <= self.limits.stall
+
+    def _trusted(self, features: Sequence[float]) -> tuple[float, str]:
+        """1 inside the training range, falling to 0 across the margin around it, and the feature that
+        decides.
+        """
+        trust, worst = 1.0, ""
+        for value, (name, low, high, margin) in zip(features, self._ranges, strict=True):
+            outside = low - value if value < low else value - high
+            if not outside <= 0.0:  # true for NaN as well
+                share = 1.0 - outside / margin
+                if not share >= trust:
+                    trust, worst = (share if share > 0.0 else 0.0), name
+        return trust, worst
+
+
+def _within(value: float, authority: float) -> float:
+    return min(authority, max(-authority, value))
+
+
+def _margin(feature: Range, share: float) -> float:
+    floor = _FLOORS.get(feature.unit, 0.1 * max(abs(feature.low), abs(feature.high), 1e-6))
+    return max(share * (feature.high - feature.low), floor)
