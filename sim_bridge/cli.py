@@ -189,6 +189,12 @@ def fly(
     model: Annotated[
         Path | None, typer.Option(help="ONNX model; the guarded correction then flies with it.")
     ] = None,
+    controller: Annotated[
+        str, typer.Option(help="lqr, lqr_integral, corrected; corrected where a model is given.")
+    ] = "",
+    trim: Annotated[
+        float, typer.Option(help="Bandwidth of the slow trim of `corrected`, rad/s; 0: none.", min=0, max=1)
+    ] = 0.25,
     repeat: Annotated[int, typer.Option(help="How often the trajectory is flown.", min=1)] = 1,
     rate: Annotated[float, typer.Option(help="Control rate, Hz.")] = 100.0,
     hidden: HiddenNames = None,
@@ -217,6 +223,7 @@ def fly(
     )
     settings = load_settings(config, {name: value for name, value in locals().items() if name in names})
     believed = load_vehicle(settings.vehicle)
+    from companion.controllers import TrimLimits
     from models.design import load_design
     from sim_bridge.in_process import Plan, record
     from sim_bridge.truth.hidden import choose
@@ -233,6 +240,8 @@ def fly(
         None if model is None else _bytes(model),
         settings.sensor_noise,
         settings.battery,
+        controller,
+        TrimLimits(bandwidth=trim),
     )
     csv_file = output.with_suffix(".csv") if table else None
     seconds = plan.repeat * plan.trajectory.duration
@@ -474,15 +483,35 @@ def pilot(
 
 @app.command(epilog="Example: sim-bridge effects --json")
 def effects(as_json: Json = False) -> None:
-    """List what can be hidden, with the range of its size when it is drawn."""
-    from sim_bridge.truth.hidden import EFFECTS
+    """List what can be hidden, with the range of its size when it is drawn, by name or `random`, and by `rich`."""
+    from sim_bridge.truth.hidden import EFFECTS, RICH
 
     rows = [
-        {"name": e.name, "what": e.what, "low": e.low, "high": e.high, "unit": next(iter(e.units.values()))}
-        for e in EFFECTS.values()
+        {
+            "name": effect.name,
+            "what": effect.what,
+            "low": effect.low,
+            "high": effect.high,
+            "unit": next(iter(effect.units.values())),
+            "random": effect.drawn,
+            "rich": RICH.get(effect.name),
+        }
+        for effect in EFFECTS.values()
     ]
-    lines = [f"{r['name']:19} {r['low']:g} to {r['high']:g} {r['unit']:6} {r['what']}" for r in rows]
-    _tell({"effects": rows}, "\n".join(lines), as_json)
+    if as_json:
+        _tell({"effects": rows}, "", as_json)
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table()
+    for column in ("effect", "drawn", "in rich", "unit", "what"):
+        table.add_column(column, no_wrap=column != "what")
+    for row in rows:
+        span = f"{row['low']:g} to {row['high']:g}"
+        rich = "{:g} to {:g}".format(*row["rich"]) if row["rich"] else ""
+        table.add_row(row["name"], span, rich, row["unit"], row["what"])
+    Console(width=100).print(table)
 
 
 def main() -> None:

@@ -9,11 +9,13 @@ import csv
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from companion.control import ControlLaw, ControlStep, State
+from companion.controllers import CORRECTED, LQR, Preview, TrimLimits, make_controller
 from companion.guard import Guard
 from companion.inference import check_model
 from models.design import Design
@@ -39,8 +41,8 @@ class Plan:
     """One flight: who flies what, with what hidden. `rate` of the control law in Hz, `model` an ONNX file's
     bytes.
 
-    With a `model` the companion's guard corrects the cascade, as controller `corrected`; otherwise it flies
-    `lqr`.
+    `controller` is one of `companion.controllers.CONTROLLERS`; `corrected` needs a `model`, the others take none.
+    Where it is empty the vehicle flies `corrected` with a model and `lqr` without.
     """
 
     vehicle: Vehicle
@@ -53,6 +55,14 @@ class Plan:
     model: bytes | None = None
     noise: Noise | None = None
     battery: BatteryState = FULL
+    controller: str = ""
+    trim: TrimLimits = field(default_factory=TrimLimits)
+
+    def __post_init__(self) -> None:
+        if not self.controller:
+            object.__setattr__(self, "controller", LQR if self.model is None else CORRECTED)
+        if (self.model is None) != (self.controller != CORRECTED):
+            raise InputError("--controller corrected needs --model, and no other controller takes one")
 
     @property
     def steps_per_tick(self) -> int:
@@ -110,6 +120,7 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     vehicle = plan.vehicle
     law = ControlLaw(vehicle, plan.design)
     guard, steps = _guard(plan), plan.steps_per_tick
+    controller = make_controller(plan.controller, law, guard, plan.trim)
     simulator = Simulator(vehicle, plan.hidden, plan.seed, plan.noise, plan.battery)
     ground = simulator.world.standing_height
     x, y, z, yaw = plan.trajectory.start
@@ -119,15 +130,25 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     ticks, touching, outcome = 0, 0, "finished"
     if guard is not None:
         guard.start()
+    controller.start()
     reported, step = simulator.reported, simulator.step
     status, inference = "off", 0.0
     begin = time.perf_counter()
-    for reference in _references(plan, period):
+    for preview in _previews(plan, period):
+        reference = preview(0.0)
         now = reported()
         px, py, pz = now.position
         position = (px, py, pz - ground)
-        state = State(position, now.velocity, now.quaternion, position[2], now.battery_voltage)
-        control = law.step(state, reference, period if ticks else 0.0, guard)
+        state = State(
+            position,
+            now.velocity,
+            now.quaternion,
+            position[2],
+            now.battery_voltage,
+            now.angular_velocity,
+            now.specific_force,
+        )
+        control = controller.step(state, preview, period if ticks else 0.0)
         if guard is not None:
             status, inference = guard.status, guard.inference_time
         on_sample(Sample(now, position, reference, control, simulator.motors, status, inference))
@@ -161,11 +182,11 @@ def _guard(plan: Plan) -> Guard | None:
     if verdict.model is None:
         raise InputError(f"--model: refused: {verdict.reason}")
     info = verdict.model.info
-    return Guard(verdict.model, info.features, wants_yaw=info.wants_yaw)
+    return Guard(verdict.model, info.features, wants_yaw=info.wants_yaw, actuation=info.actuation)
 
 
-def _references(plan: Plan, period: float) -> Iterator[ReferenceSample]:
-    """The trajectory as often as asked, with a transfer from its end back to its start in between."""
+def _previews(plan: Plan, period: float) -> Iterator[Preview]:
+    """The reference ahead of each tick: the trajectory as often as asked, with a transfer from end to start between."""
     trajectory = plan.trajectory
     back = None
     if math.dist(trajectory.end, trajectory.start) > 1e-6:
@@ -178,9 +199,13 @@ def _references(plan: Plan, period: float) -> Iterator[ReferenceSample]:
     offset, tick = 0.0, 0
     for leg in legs:
         while tick * period - offset < leg.duration:
-            yield leg.at(tick * period - offset)
+            yield partial(_ahead, leg, tick * period - offset)
             tick += 1
         offset += leg.duration
+
+
+def _ahead(leg: Trajectory, t: float, ahead: float) -> ReferenceSample:
+    return leg.at(t + ahead)
 
 
 def record(
@@ -238,7 +263,7 @@ class _TickWriter:
         self._interval = 1.0 / plan.rate
         # What is the same in every tick is set once; each tick then overwrites all the rest.
         self._tick = Tick(
-            controller="lqr" if plan.model is None else "corrected",
+            controller=plan.controller,
             trajectory=plan.trajectory.name,
             phase="mission",
             flight_mode="OFFBOARD",
