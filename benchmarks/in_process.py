@@ -79,7 +79,7 @@ def measure(vehicle_file: Path, repeat: int) -> dict[str, object]:
         "flight": best(repeat, lambda: fly(plan, lambda sample: None).times_real_time),
         "flight, recorded": best(repeat, lambda: recorded(plan)),
     }
-    for name in EFFECTS:
+    for name in (*EFFECTS, "rich"):
         hiding = Plan(vehicle, design, plan.trajectory, choose([name], vehicle, 1), 1)
         times[f"flight, {name}"] = best(repeat, lambda p=hiding: fly(p, lambda sample: None).times_real_time)
     ratio = times["flight"] / times["bare MuJoCo"]

@@ -486,7 +486,7 @@ def effects(as_json: Json = False) -> None:
     """List what can be hidden, with the range of its size when it is drawn, by name or `random`, and by `rich`."""
     from sim_bridge.truth.hidden import EFFECTS, RICH
 
-    rows = [
+    rows: list[dict[str, Any]] = [
         {
             "name": effect.name,
             "what": effect.what,

@@ -15,7 +15,7 @@ from models.vehicle import Vehicle
 from sim_bridge.parameters import Parameters
 from sim_bridge.seal import reveal, seal
 from sim_bridge.settings import load_settings
-from sim_bridge.truth.hidden import EFFECTS, choose
+from sim_bridge.truth.hidden import EFFECTS, RICH, choose
 
 VEHICLE = ("--vehicle", str(QUAD5 / "vehicle.toml"))
 
@@ -98,6 +98,9 @@ def test_fly_writes_a_record_and_seals_the_answer(tmp_path: Path) -> None:
         (("run", *VEHICLE, "--param", "NO_SUCH=1"), "NAME=VALUE"),
         (("run", *VEHICLE, "--config", "missing.toml"), "missing.toml: cannot read"),
         (("run", *VEHICLE, "--pilot-mode", "ASLEEP"), "choose one of"),
+        (("run", *VEHICLE, "--charge", "1.2"), "--charge 1.2 is outside 0.05 to 1"),
+        (("run", *VEHICLE, "--battery-age", "9"), "--battery-age 9"),
+        (("run", *VEHICLE, "--hidden", "riche"), "did you mean 'rich'"),
         (("fly", "--trajectory", "nowhere", *VEHICLE, "-o", "x.mcap"), "no trajectory 'nowhere'"),
         (("reveal", "missing.sealed"), "missing.sealed: cannot read"),
     ],
@@ -128,6 +131,17 @@ def test_a_pilot_without_a_vehicle_is_told() -> None:
 def test_effects_lists_what_can_be_hidden() -> None:
     listed = json.loads(command("effects", "--json").stdout)["effects"]
     assert [row["name"] for row in listed] == list(EFFECTS)
+    assert {row["name"]: tuple(row["rich"]) for row in listed if row["rich"]} == RICH
+    assert {row["name"] for row in listed if not row["random"]} == {"estimator_delay", "payload"}
+
+
+def test_a_flight_on_a_weak_battery_sinks_where_thrust_follows_the_voltage(tmp_path: Path) -> None:
+    errors = []
+    for charge in ("0.97", "0.4"):
+        hover = ("fly", "--trajectory", "hover", *VEHICLE, "--hidden", "battery_sag:1.5", "--charge", charge)
+        done = command(*hover, "-o", f"{charge}.mcap", "--json", cwd=tmp_path)
+        errors.append(json.loads(done.stdout)["rms_error"]["z"])
+    assert errors[0] < 0.1 < 0.15 < errors[1]
 
 
 def test_the_example_configuration_holds_the_defaults(vehicle: Vehicle) -> None:
