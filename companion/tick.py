@@ -50,6 +50,7 @@ def make_tick(odometry: Odometry, latest: Latest, outcome: Outcome, latency: flo
         _set(tick.feedback.body_rate, step.feedback.body_rate)
         _set(tick.correction, step.correction)
         _set(tick.correction_raw, step.correction_raw)
+        _set(tick.trim, step.trim)
         _set(tick.body_rate_command, step.command.body_rate)
         tick.thrust_command = step.thrust_command
     return tick

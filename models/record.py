@@ -189,7 +189,7 @@ class FlightRecord:
 
     `ticks` maps column names to arrays (N,) or (N, k): those of `models.flight.COLUMNS` plus `t` (s of the
     vehicle's clock since the first tick), `vehicle_time` and `host_time` (s), `feedback_thrust` (N),
-    `feedback_body_rate` (rad/s), `correction`, `correction_raw` (m/s², heading frame), `interval`, `latency`,
+    `feedback_body_rate` (rad/s), `correction`, `trim`, `correction_raw` (m/s², heading frame), `interval`, `latency`,
     `inference` (s), `setpoint_sent`, `armed` (bool) and the words `model`, `controller`, `flight_mode`,
     `phase`, `guard`, `trajectory`, `shadow` (hash of a model evaluated but not applied), with `shadow_raw`
     (m/s², heading frame) for what that returned. What was never known is absent; what is missing in a tick is
@@ -339,6 +339,7 @@ _VECTORS = (
     "correction_raw",
     "body_rate_command",
     "shadow_raw",
+    "trim",
 )
 
 
@@ -361,7 +362,14 @@ def tick_columns(ticks: Iterable[Tick]) -> dict[str, np.ndarray]:
         [tuple(t.rotor_speed)[:4] if len(t.rotor_speed) >= 4 else (np.nan,) * 4 for t in ticks], dtype=float
     ).reshape(-1, 4)
     columns["battery_voltage"][columns["battery_voltage"] == 0.0] = np.nan
-    for name in ("specific_force", "rotor_speed", "battery_voltage", "position_reference", "shadow_raw"):
+    for name in (
+        "specific_force",
+        "rotor_speed",
+        "battery_voltage",
+        "position_reference",
+        "shadow_raw",
+        "trim",
+    ):
         if not np.any(np.isfinite(columns[name])):
             del columns[name]
     vehicle_time = np.array([tick.vehicle_time_us for tick in ticks], dtype=np.int64)

@@ -306,6 +306,8 @@ class _TickWriter:
         v.x, v.y, v.z = control.correction
         v = tick.correction_raw
         v.x, v.y, v.z = control.correction_raw
+        v = tick.trim
+        v.x, v.y, v.z = control.trim
         tick.thrust_command = control.thrust_command
         v = tick.body_rate_command
         v.x, v.y, v.z = control.command.body_rate
