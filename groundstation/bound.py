@@ -35,8 +35,7 @@ from typing import Literal
 
 import numpy as np
 
-from groundstation.expected import Reference, expected_behaviour
-from groundstation.measurement import ACCELEROMETER_BANDWIDTH, DIFFERENTIATED_BANDWIDTH, measure
+from groundstation.expected import Behaviour, Reference, expected_behaviour
 from groundstation.tracking import missions, reference_of
 from models.design import Design, hover_input_matrix
 from models.errors import InputError
@@ -45,6 +44,13 @@ from models.frames import euler_from_quaternion, rotate, world_from_heading
 from models.vehicle import GRAVITY
 
 Around = Literal["design", "reference"]
+
+BANDWIDTH = 5.0
+"""Hz, of the low-pass on d and eta alike. The equation above is linear: what is filtered obeys it exactly, so the
+filter hides nothing, and ten times the loop's own bandwidth lets pass all that moves the vehicle."""
+AGREEMENT = 0.5
+"""Hz below which position, velocity and acceleration are made to agree, where an estimator's velocity is not the slope
+of its position, and an accelerometer has a bias. Both act on the vehicle as disturbances do: so they belong in d."""
 
 JUMP_POSITION, JUMP_VELOCITY = 1e-3, 1e-2
 """m and m/s: what a reference moves by more than its own velocity and acceleration explain is a jump."""
@@ -73,23 +79,20 @@ Balls = tuple[Ball, Ball, Ball]
 @dataclass(frozen=True)
 class Disturbance:
     """By what the acceleration of a flight differed from what its ideal position loop asked for, over the M samples of
-    its missions, at the rows `rows` (M,) of the flight; `around` the design, less the same of the design itself.
+    its missions; `around` the design, less the same of the design itself.
 
     `total` (M, 3) m/s², world ENU, is the sum of `model` (delta - delta_hat: error of the hover model (10), less the
     correction as applied) and `attitude` (A_zeta times the attitude not yet reached, and commands at their limits); all
-    behind the same zero-phase low-pass of `bandwidth` Hz; `noise` (3,) is the RMS that the accelerometer's noise leaves
-    in it, body axes. `stretches` are the slices of the M samples that one mission each has.
+    behind a zero-phase low-pass of `bandwidth` Hz. `stretches` are the slices of the M samples of each mission.
     """
 
     flight: Flight
     around: Around
-    rows: np.ndarray
     stretches: tuple[slice, ...]
     total: np.ndarray
     model: np.ndarray
     attitude: np.ndarray
     bandwidth: float
-    noise: np.ndarray
 
     def radius(self, balls: Balls, part: Literal["total", "model", "attitude"] = "total") -> np.ndarray:
         """Radius (3,) of the ball in m/s², per axis of the world, of d or of one part of it alone."""
@@ -119,7 +122,9 @@ class Tube:
     """A flight in its predicted tube, over the M samples of its missions, axes x, y, z of the world.
 
     `balls` one an axis; `radius` (3,) and `bound` (3,) in m/s², of the mean of d over the loop's memory and of the
-    largest |d|, both of the flight `bound_from`; `disturbance` is what really acted.
+    largest |d|, both of the flight `bound_from`; `disturbance` is what really acted. `resolution` (3,) in m/s² is how
+    far the measured error strays from the one that the measured d explains, the most that V^(1/2) owes to the sensors:
+    only what is further out than that has left the tube.
     `eta` (M, 3, 2) is the position and velocity error (m, m/s) to the reference, `centre` (M, 3, 2) where in it the
     tube has its middle: zero around the reference; around the design, what the linear design itself leaves. `level`
     (M, 3) is V^(1/2) of their difference and `predicted` (M, 3) what the tube allows (m/s²). `jumps` are the times at
@@ -132,6 +137,7 @@ class Tube:
     radius: np.ndarray
     bound: np.ndarray
     bound_from: str
+    resolution: np.ndarray
     disturbance: Disturbance
     t: np.ndarray
     position: np.ndarray
@@ -146,8 +152,8 @@ class Tube:
 
     @property
     def inside(self) -> np.ndarray:
-        """Share of time inside the tube, per axis (3,)."""
-        return np.mean(_within(self.level, self.predicted), axis=0)
+        """Share of time inside the tube, as far as the sensors can tell, per axis (3,)."""
+        return np.mean(self.level <= self.predicted + self.resolution, axis=0)
 
     @property
     def distance(self) -> np.ndarray:
@@ -168,9 +174,8 @@ class Tube:
 
 def balls_of(design: Design) -> Balls:
     """The balls of the axes x, y, z. Raises `InputError` where the gains couple the axes or tell x from y."""
-    a_zeta = hover_input_matrix(design.mass)
-    gains = a_zeta @ np.array(design.K_eta)
-    position, velocity = np.diag(gains[:, :3]), np.diag(gains[:, 3:])
+    gains = hover_input_matrix(design.mass) @ np.array(design.K_eta)
+    position, velocity = _gains(design).T
     rest = gains - np.hstack([np.diag(position), np.diag(velocity)])
     if np.abs(rest).max() > 1e-6 * np.abs(gains).max() or not (
         np.isclose(position[0], position[1]) and np.isclose(velocity[0], velocity[1])
@@ -250,88 +255,40 @@ def jumps_of(t: np.ndarray, reference: Reference) -> np.ndarray:
     return out
 
 
-def disturbance(
-    flight: Flight, design: Design, around: Around = "design", bandwidth: float | None = None
-) -> Disturbance:
-    """What disturbed the position loop of a flight. Raises `InputError` where it lacks what that needs.
-
-    Measured by the accelerometer, otherwise by differentiated velocity. The low-pass is there because the
-    accelerometer's noise is no acceleration, and it hides little: 1 m/s² at 20 Hz moves by 0.06 mm and 8 mm/s.
-    """
-    velocity, quaternion = flight.column("velocity"), flight.column("quaternion")
-    noise = measure(flight, bandwidth, thin=False).noise
-    zeta = euler_from_quaternion(quaternion)
-    thrust = flight.vehicle.thrust(flight.column("thrust_command"))
-    hover = np.stack([zeta[:, 0], zeta[:, 1], thrust - flight.vehicle.weight], -1)
-    linear = _accelerations(design, hover, zeta[:, 2])
-    correction = flight.extra.get("correction", np.zeros((len(flight), 3)))
-    corrected = world_from_heading(np.nan_to_num(correction), zeta[:, 2])
-    if flight.specific_force is not None:
-        acceleration = rotate(quaternion, flight.specific_force) - [0.0, 0.0, GRAVITY]
-        default = ACCELEROMETER_BANDWIDTH if flight.accelerometer else flight.bandwidth
-    else:
-        acceleration, default = np.gradient(velocity, flight.t, axis=0), DIFFERENTIATED_BANDWIDTH
-    bandwidth = min(bandwidth or default or DIFFERENTIATED_BANDWIDTH, 0.4 / flight.dt)
-    stretches, total, model = missions(flight), [], []
-    for rows in stretches:
-        reference = reference_of(flight, rows)
-        whole = acceleration[rows] - _asked(design, reference, _eta(flight, rows, reference))
-        if around == "design":
-            whole = whole - _of_the_design(flight, design, rows, reference)[1]
-        part = acceleration[rows] - linear[rows] - corrected[rows]
-        jumps = np.flatnonzero(np.any(jumps_of(flight.t[rows], reference) != 0.0, axis=(1, 2)))
-        total.append(_low_pass(whole, jumps, bandwidth, flight.dt))
-        model.append(_low_pass(part, jumps, bandwidth, flight.dt))
-    d, of_model = np.concatenate(total), np.concatenate(model)
-    edges = np.cumsum([0, *(len(rows) for rows in stretches)]).tolist()
-    return Disturbance(
-        flight=flight,
-        around=around,
-        rows=np.concatenate(stretches),
-        stretches=tuple(slice(a, b) for a, b in itertools.pairwise(edges)),
-        total=d,
-        model=of_model,
-        attitude=d - of_model,
-        bandwidth=bandwidth,
-        noise=noise,
-    )
-
-
 def predict_tube(
     flight: Flight,
     design: Design,
     label: str = "",
     around: Around = "design",
     bound_from: Flight | None = None,
-    bandwidth: float | None = None,
+    bandwidth: float = BANDWIDTH,
 ) -> Tube:
     """The tube of a flight, from the bound on d that the flight `bound_from` shows, otherwise the flight itself.
 
     Each mission's tube begins at the flown state; from there on it knows the reference and the bound, and nothing of
-    the flight. Raises `InputError`.
+    the flight. Raises `InputError` where a flight lacks what this needs.
     """
     balls = balls_of(design)
-    own = disturbance(flight, design, around, bandwidth)
+    flown = [_mission(flight, design, rows, around, bandwidth) for rows in missions(flight)]
+    own = _disturbance(flight, around, flown, bandwidth)
     source = own if bound_from is None else disturbance(bound_from, design, around, bandwidth)
     radius, bound = source.radius(balls), np.abs(source.total).max(axis=0)
-    parts = []
-    for rows in missions(flight):
-        t, reference = flight.t[rows], reference_of(flight, rows)
-        eta, jumps = _eta(flight, rows, reference), jumps_of(t, reference)
-        centre = np.zeros_like(eta)
-        if around == "design":  # both solutions jump with the reference: their distance does not
-            centre, _ = _of_the_design(flight, design, rows, reference)
-            jumps = np.zeros_like(jumps)
-        level = np.stack([ball.level((eta - centre)[:, k]) for k, ball in enumerate(balls)], -1)
-        predicted = np.stack(
-            [tube(ball, radius[k], bound[k], t, level[0, k], jumps[:, k]) for k, ball in enumerate(balls)],
-            -1,
-        )
-        jumped = t[np.any(jumps != 0.0, axis=(1, 2))]
-        parts.append((t, reference.position, eta, centre, level, predicted, jumped, t[:1]))
-    t, wanted, eta, centre, level, predicted, jumped, starts = (
-        np.concatenate(columns) for columns in zip(*parts, strict=True)
+    resolution = np.max(
+        [[ball.level(m.unexplained[:, k]).max() for k, ball in enumerate(balls)] for m in flown], axis=0
     )
+    levels, tubes = [], []
+    for mission in flown:
+        away = mission.eta - mission.centre
+        level = np.stack([ball.level(away[:, k]) for k, ball in enumerate(balls)], -1)
+        levels.append(level)
+        tubes.append(
+            [
+                tube(ball, radius[k], bound[k], mission.t, level[0, k], mission.jumps[:, k])
+                for k, ball in enumerate(balls)
+            ]
+        )
+    t = np.concatenate([m.t for m in flown])
+    level, predicted = np.concatenate(levels), np.concatenate([np.stack(each, -1) for each in tubes])
     return Tube(
         flight=flight,
         label=label or flight.name,
@@ -339,40 +296,142 @@ def predict_tube(
         radius=radius,
         bound=bound,
         bound_from=source.flight.origin or source.flight.name,
+        resolution=resolution,
         disturbance=own,
         t=t,
-        position=flight.column("position")[own.rows],
-        reference=wanted,
-        eta=eta,
-        centre=centre,
+        position=np.concatenate([m.position for m in flown]),
+        reference=np.concatenate([m.reference for m in flown]),
+        eta=np.concatenate([m.eta for m in flown]),
+        centre=np.concatenate([m.centre for m in flown]),
         level=level,
         predicted=predicted,
-        jumps=jumped,
-        starts=starts,
-        leavings=_leavings(t, level, predicted),
+        jumps=np.concatenate([m.t[np.any(m.jumps != 0.0, axis=(1, 2))] for m in flown]),
+        starts=np.array([m.t[0] for m in flown]),
+        leavings=_leavings(t, level, predicted, resolution),
     )
 
 
-def _of_the_design(
-    flight: Flight, design: Design, rows: np.ndarray, reference: Reference
-) -> tuple[np.ndarray, np.ndarray]:
-    """What the linear design itself leaves on this reference from the flown start: eta (M, 3, 2), and its d (M, 3)."""
-    zeta = euler_from_quaternion(flight.column("quaternion")[rows[:1]])[0]
-    start = (flight.column("position")[rows[0]], flight.column("velocity")[rows[0]], zeta)
-    behaviour = expected_behaviour(design, flight.t[rows], reference, start)
-    eta = np.stack([behaviour.position - reference.position, behaviour.velocity - reference.velocity], -1)
-    asked = _asked(design, reference, eta)
-    attitude = np.stack([behaviour.zeta[:, 0], behaviour.zeta[:, 1], np.zeros(len(rows))], -1)
-    reached = _accelerations(design, attitude, behaviour.zeta[:, 2])
-    reached[:, 2] = asked[:, 2]  # thrust acts at once in the linear design
-    return eta, reached - asked
+def disturbance(
+    flight: Flight, design: Design, around: Around = "design", bandwidth: float = BANDWIDTH
+) -> Disturbance:
+    """What disturbed the position loop of a flight: measured by the accelerometer, else by differentiated velocity.
+
+    Raises `InputError` where the flight lacks what that needs.
+    """
+    flown = [_mission(flight, design, rows, around, bandwidth) for rows in missions(flight)]
+    return _disturbance(flight, around, flown, bandwidth)
+
+
+@dataclass(frozen=True)
+class _Mission:
+    """One stretch of a flight, world ENU: `t`, flown and reference `position` (M, 3), `eta`, `centre` and `jumps`
+    (M, 3, 2) as in `Tube`, `total` and `model` (M, 3) as in `Disturbance`; `unexplained` (M, 3, 2) is by what eta
+    strays from the solution of its equation under `total`."""
+
+    t: np.ndarray
+    position: np.ndarray
+    reference: np.ndarray
+    eta: np.ndarray
+    centre: np.ndarray
+    jumps: np.ndarray
+    total: np.ndarray
+    model: np.ndarray
+    unexplained: np.ndarray
+
+
+def _mission(flight: Flight, design: Design, rows: np.ndarray, around: Around, bandwidth: float) -> _Mission:
+    t, dt = flight.t[rows], flight.dt
+    zeta = euler_from_quaternion(flight.column("quaternion")[rows])
+    position, velocity, acceleration = _agreeing(flight, rows)
+    reference = reference_of(flight, rows)
+    behaviour = expected_behaviour(design, t, reference, (position[0], velocity[0], zeta[0]))
+    centre = np.stack([behaviour.position - reference.position, behaviour.velocity - reference.velocity], -1)
+    own = _own_disturbance(design, reference, behaviour, centre)
+    eta = np.stack([position - reference.position, velocity - reference.velocity], -1)
+    # The design's own flight is free of noise and jumps as the flown one does: only their distance is filtered.
+    away = _low_pass(eta - centre, bandwidth, dt)
+    total = _low_pass(acceleration - _asked(design, reference, eta) - own, bandwidth, dt)
+    thrust = flight.vehicle.thrust(flight.column("thrust_command")[rows])
+    hover = np.stack([zeta[:, 0], zeta[:, 1], thrust - flight.vehicle.weight], -1)
+    correction = (
+        flight.extra["correction"][rows] if "correction" in flight.extra else np.zeros((len(rows), 3))
+    )
+    corrected = world_from_heading(np.nan_to_num(correction), zeta[:, 2])
+    model = _low_pass(acceleration - _accelerations(design, hover, zeta[:, 2]) - corrected, bandwidth, dt)
+    jumps, middle = jumps_of(t, reference), centre
+    unexplained = away - _solved(design, t - t[0], away[0], total)
+    if around == "design":  # both solutions jump with the reference: their distance does not
+        jumps = np.zeros_like(jumps)
+    else:
+        middle, total = np.zeros_like(centre), total + own
+    return _Mission(t, position, reference.position, away + centre, middle, jumps, total, model, unexplained)
+
+
+def _solved(design: Design, t: np.ndarray, start: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """eta (M, 3, 2) of the ideal position loop from `start` (3, 2) under d (M, 3), at even times `t` (M,) from 0."""
+    from scipy import signal
+
+    out = np.empty((len(t), 3, 2))
+    for k, (p, v) in enumerate(_gains(design)):
+        system = ([[0.0, 1.0], [-p, -v]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1)))
+        even = np.linspace(0.0, t[-1], len(t))
+        out[:, k] = signal.lsim(system, d[:, k], even, X0=start[k])[1]
+    return out
+
+
+def _disturbance(flight: Flight, around: Around, flown: list[_Mission], bandwidth: float) -> Disturbance:
+    total, model = (np.concatenate(parts) for parts in zip(*((m.total, m.model) for m in flown), strict=True))
+    edges = np.cumsum([0, *(len(m.t) for m in flown)]).tolist()
+    return Disturbance(
+        flight=flight,
+        around=around,
+        stretches=tuple(slice(a, b) for a, b in itertools.pairwise(edges)),
+        total=total,
+        model=model,
+        attitude=total - model,
+        bandwidth=bandwidth,
+    )
+
+
+def _agreeing(flight: Flight, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, velocity and acceleration (M, 3), world ENU, each the slope of the one before below `AGREEMENT` Hz."""
+    t, dt = flight.t[rows], flight.dt
+    position, velocity = flight.column("position")[rows], flight.column("velocity")[rows]
+
+    def agreeing(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
+        # What is left of the values without the integral of their slope holds no motion, only error: it is smooth, and
+        # a filter does it no harm where the flight begins and ends.
+        steps = 0.5 * np.diff(t)[:, None] * (slope[1:] + slope[:-1])
+        error = values - values[0] - np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        return slope + np.gradient(_low_pass(error, AGREEMENT, dt, 2), t, axis=0)
+
+    velocity = agreeing(position, velocity)
+    if flight.specific_force is None:
+        return position, velocity, np.gradient(velocity, t, axis=0)
+    quaternion = flight.column("quaternion")[rows]
+    acceleration = rotate(quaternion, flight.specific_force[rows]) - [0.0, 0.0, GRAVITY]
+    return position, velocity, agreeing(velocity, acceleration)
+
+
+def _own_disturbance(
+    design: Design, reference: Reference, behaviour: Behaviour, eta: np.ndarray
+) -> np.ndarray:
+    """d (M, 3) of the linear design itself, which its attitude loop (13) makes; thrust acts at once."""
+    attitude = np.stack([behaviour.zeta[:, 0], behaviour.zeta[:, 1], np.zeros(len(eta))], -1)
+    d = _accelerations(design, attitude, behaviour.zeta[:, 2]) - _asked(design, reference, eta)
+    d[:, 2] = 0.0
+    return d
+
+
+def _gains(design: Design) -> np.ndarray:
+    """Position and velocity gain (3, 2) of each axis, in 1/s² and 1/s."""
+    gains = hover_input_matrix(design.mass) @ np.array(design.K_eta)
+    return np.stack([np.diag(gains[:, :3]), np.diag(gains[:, 3:])], -1)
 
 
 def _asked(design: Design, reference: Reference, eta: np.ndarray) -> np.ndarray:
     """Acceleration (M, 3), world ENU, that the ideal position loop (16) asks for at errors eta (M, 3, 2)."""
-    gains = hover_input_matrix(design.mass) @ np.array(design.K_eta)
-    p, v = np.diag(gains[:, :3]), np.diag(gains[:, 3:])
-    return reference.acceleration - p * eta[:, :, 0] - v * eta[:, :, 1]
+    return reference.acceleration - np.sum(_gains(design) * eta, axis=-1)
 
 
 def _accelerations(design: Design, hover: np.ndarray, yaw: np.ndarray) -> np.ndarray:
@@ -380,34 +439,20 @@ def _accelerations(design: Design, hover: np.ndarray, yaw: np.ndarray) -> np.nda
     return world_from_heading(hover @ hover_input_matrix(design.mass).T, yaw)
 
 
-def _eta(flight: Flight, rows: np.ndarray, reference: Reference) -> np.ndarray:
-    """Position and velocity error (M, 3, 2), world ENU."""
-    position, velocity = flight.column("position")[rows], flight.column("velocity")[rows]
-    return np.stack([position - reference.position, velocity - reference.velocity], -1)
-
-
-def _low_pass(values: np.ndarray, jumps: np.ndarray, bandwidth: float, dt: float) -> np.ndarray:
-    """Values (M, 3) behind a zero-phase low-pass that does not reach across the jumps, given as rows."""
+def _low_pass(values: np.ndarray, bandwidth: float, dt: float, order: int = 4) -> np.ndarray:
+    """Values (M, ...) behind a zero-phase low-pass."""
     from scipy import signal
 
-    sos = signal.butter(4, bandwidth, fs=1.0 / dt, output="sos")
-    out = values.copy()
-    edges = [0, *jumps.tolist(), len(values)]
-    for begin, end in itertools.pairwise(edges):
-        if end - begin > 3:
-            padding = min(end - begin - 1, int(1.0 / dt))
-            out[begin:end] = signal.sosfiltfilt(sos, values[begin:end], axis=0, padlen=padding)
-    return out
+    sos = signal.butter(order, min(bandwidth, 0.4 / dt), fs=1.0 / dt, output="sos")
+    return signal.sosfiltfilt(sos, values, axis=0, padlen=min(len(values) - 1, int(1.0 / dt)))
 
 
-def _within(level: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    return level <= predicted * (1.0 + 1e-9) + 1e-12
-
-
-def _leavings(t: np.ndarray, level: np.ndarray, predicted: np.ndarray) -> tuple[Leaving, ...]:
+def _leavings(
+    t: np.ndarray, level: np.ndarray, predicted: np.ndarray, resolution: np.ndarray
+) -> tuple[Leaving, ...]:
     found = []
     for k, axis in enumerate("xyz"):
-        outside = np.flatnonzero(~_within(level[:, k], predicted[:, k]))
+        outside = np.flatnonzero(level[:, k] > predicted[:, k] + resolution[k])
         if outside.size == 0:
             continue
         for rows in np.split(outside, np.flatnonzero(np.diff(t[outside]) > APART) + 1):

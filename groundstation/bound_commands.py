@@ -53,9 +53,8 @@ def bound_command(
         typer.Option("--around", help="Middle of the tube: the linear design's flight, or the reference."),
     ] = AroundWhat.design,
     bandwidth: Annotated[
-        float | None,
-        typer.Option("--bandwidth", help="Low-pass on d, Hz; default: 20, 5 without IMU.", min=0.1),
-    ] = None,
+        float, typer.Option("--bandwidth", help="Low-pass on d and eta alike, Hz.", min=1.0)
+    ] = 5.0,
     rrd: Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
@@ -112,7 +111,7 @@ def _print(tube: Tube) -> None:
     memories = sorted({f"{0.5 / ball.decay:.1f}" for ball in tube.balls})
     console.print(
         f"radius: the most that d of {escape(tube.bound_from)} has as RMS over the loop's memory of "
-        f"{' to '.join(memories)} s, below {d.bandwidth:g} Hz (sensor noise: {d.noise.max():.2f})",
+        f"{' to '.join(memories)} s, below {d.bandwidth:g} Hz; the sensors resolve {tube.resolution.max():.2f} m/s²",
         highlight=False,
     )
     if len(tube.jumps):
@@ -142,13 +141,13 @@ def _table(tube: Tube) -> dict[str, Any]:
         "around": d.around,
         "bound_from": tube.bound_from,
         "bandwidth": d.bandwidth,
-        "noise_rms": d.noise.tolist(),
         "axes": {
             axis: {
                 "P": tube.balls[k].P.tolist(),
                 "decay": tube.balls[k].decay,
                 "bound": float(tube.bound[k]),
                 "radius": float(tube.radius[k]),
+                "resolution": float(tube.resolution[k]),
                 "ball_position": float(tube.ball[k, 0]),
                 "ball_velocity": float(tube.ball[k, 1]),
                 "d": float(abs(d.total[:, k]).max()),

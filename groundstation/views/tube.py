@@ -126,7 +126,7 @@ def _log_space(stream: rr.RecordingStream, tube: Tube, clock: np.ndarray) -> Non
         ),
         static=True,
     )
-    outside = np.any(tube.level > tube.predicted * (1.0 + 1e-9) + 1e-12, axis=1)
+    outside = np.any(tube.level > tube.predicted + tube.resolution, axis=1)
     if outside.any():
         points = tube.position[outside][thin(int(outside.sum()), 500)]
         stream.log("space/outside", rr.Points3D(points, colors=[LINEAR], radii=0.012 * size), static=True)
