@@ -58,7 +58,7 @@ def _read(path: Path, vehicle: Path | None, mapping: Path | None) -> Flight:
     return read_flight(path, vehicle, mapping)
 
 
-def _model(which: str | None, flight: Flight, store: Path, effects: Path | None) -> Model:
+def chosen_model(which: str | None, flight: Flight, store: Path, effects: Path | None) -> Model:
     """The model asked for; else the newest version of the vehicle; else linear with exact rotation."""
     from dataclasses import replace
 
@@ -116,7 +116,9 @@ def compare_command(
     from groundstation.where import where_it_fails
 
     read = _read(flight, vehicle, mapping)
-    results = [compare(read, m, bandwidth) for m in _versions(_model(model, read, store, effects), store)]
+    results = [
+        compare(read, m, bandwidth) for m in _versions(chosen_model(model, read, store, effects), store)
+    ]
     where = where_it_fails(results[-1])
     if rrd is not None:
         from groundstation.views import write_comparison
@@ -167,7 +169,7 @@ def where_command(
     from groundstation.where import where_it_fails
 
     read = _read(flight, vehicle, mapping)
-    result = compare(read, _model(model, read, store, effects), bandwidth, horizons=False)
+    result = compare(read, chosen_model(model, read, store, effects), bandwidth, horizons=False)
     where = where_it_fails(result)
     if rrd is not None:
         from groundstation.views import write_where
@@ -207,10 +209,15 @@ def diagnose_command(
 
     read = _read(flight, vehicle, mapping)
     held_out = None if validate is None else _read(validate, vehicle or _same(read), mapping)
-    base = _model(model, read, store, effects)
+    base = chosen_model(model, read, store, effects)
     if "rigid_body" not in base.names():
         from models.model import rigid_body_model
 
+        if base.network is not None:
+            raise InputError(
+                f"the network of {base.label} was trained beside the linear model, and diagnosis starts from exact "
+                "rotation; pass --model with a version that has rigid_body, or --model linear"
+            )
         base = rigid_body_model(read.vehicle, base.effects_directory)
     with nullcontext() if as_json else console.status("looking for missing effects") as status:
         result = diagnose(
@@ -340,7 +347,7 @@ def model_add(
 
     read = _read(flight, vehicle, mapping)
     held_out = None if validate is None else _read(validate, vehicle or _same(read), mapping)
-    base = _model(model, read, store, effects)
+    base = chosen_model(model, read, store, effects)
     with nullcontext() if as_json else console.status(f"fitting {effect}"):
         made = add_effect(base, effect, [read], bandwidth)
     made, path = save(store, made, base if base.version else None)
@@ -355,12 +362,19 @@ def model_add(
             {
                 **tables_json.model_table(made),
                 "path": str(path),
+                "network_dropped": base.network is not None,
                 "waterfall": tables_json.waterfall_table(steps),
                 "recording": None if rrd is None else str(rrd),
             }
         )
         return
     print_waterfall(console, steps, read.name, None if held_out is None else held_out.name)
+    if base.network is not None:
+        console.print(
+            f"v{made.version} has no network: that of v{base.version} was trained on what is left without {effect}; "
+            f"train a new one with 'groundstation train FLIGHT... --model v{made.version}'",
+            style="yellow",
+        )
     term = made.terms[-1]
     for name, value in term.values.items():
         low, high = term.intervals[name]
@@ -404,8 +418,8 @@ def model_list(
             m.vehicle.name,
             f"v{m.version}",
             parent,
-            ", ".join(m.names()),
-            f"{m.fit.get('rms', 0.0):.3f}",
+            ", ".join((*m.names(), *(() if m.network is None else (m.network.label,)))),
+            f"{_fit_rms(m):.3f}",
             m.created,
         )
     console.print(table)
@@ -432,7 +446,7 @@ def model_show(
         print_json(model_table(model))
         return
     console.print(
-        f"{model.label} of {model.vehicle.name}, made {model.created}, fit RMS {model.fit.get('rms', 0):.3f} m/s²"
+        f"{model.label} of {model.vehicle.name}, made {model.created}, fit RMS {_fit_rms(model):.3f} m/s²"
     )
     for term in model.terms:
         values = ", ".join(
@@ -442,6 +456,21 @@ def model_show(
             for k, v in term.values.items()
         )
         console.print(f"  {term.effect}  {values}", highlight=False)
+    if (n := model.network) is not None:
+        console.print(
+            f"  {n.label}  {n.parameters} parameters, recipe {n.recipe}, seed {n.seed}, hash {n.hash}; held-out RMS "
+            f"{n.fit.get('before_rms', 0):.3f} -> {n.fit.get('validation_rms', 0):.3f} m/s² "
+            f"(noise floor {n.fit.get('noise_floor', 0):.3f})",
+            highlight=False,
+        )
+        ranges = zip(n.features, n.low, n.high, strict=True)
+        told = ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges)
+        console.print(f"  trained within {told}", highlight=False)
+
+
+def _fit_rms(model: Model) -> float:
+    """Residual RMS of the fit, m/s²: of the network's training where there is one."""
+    return model.fit.get("rms", 0.0) if model.network is None else model.network.fit.get("train_rms", 0.0)
 
 
 @model_app.command("export")

@@ -9,6 +9,7 @@ import numpy as np
 
 from groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
 from models.model import Model
+from models.network import Network
 
 UNIT = "m/s^2"
 
@@ -119,6 +120,24 @@ def model_table(model: Model) -> dict[str, Any]:
             "created": model.created,
             "data_hash": model.data_hash,
             "fit": dict(model.fit),
+            "network": None if model.network is None else network_summary(model.network),
+        }
+    )
+
+
+def network_summary(network: Network) -> dict[str, Any]:
+    """The JSON of a network, without its weights."""
+    ranges = zip(network.features, network.low, network.high, strict=True)
+    return plain(
+        {
+            "hash": network.hash,
+            "layers": list(network.widths),
+            "parameters": network.parameters,
+            "features": {name: {"low": low, "high": high} for name, low, high in ranges},
+            "recipe": network.recipe,
+            "seed": network.seed,
+            "data_hash": network.data_hash,
+            "fit": dict(network.fit),
         }
     )
 

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import typer
 
-from groundstation import analysis_commands, collect_commands, flight_commands, pilot_commands
+from groundstation import (
+    analysis_commands,
+    bound_commands,
+    collect_commands,
+    flight_commands,
+    pilot_commands,
+    train_commands,
+)
 from models.errors import run_command_line
 
 app = typer.Typer(
@@ -19,6 +26,8 @@ app = typer.Typer(
 )
 flight_commands.register(app)
 analysis_commands.register(app)
+bound_commands.register(app)
+train_commands.register(app)
 pilot_commands.register(app)
 collect_commands.register(app)
 

@@ -31,13 +31,13 @@ def compare(
     motion = motion_of_flight(flight)
     thinned = measure(flight, bandwidth)
     chain = with_clock(thinned, model.chain())
-    measured = _heading_acceleration(motion, measurement.value)
+    measured = heading_acceleration(motion, measurement.value)
     predicted = _predicted(measurement, motion, chain)
     linear = _predicted(measurement, motion, with_clock(thinned, linear_model(flight.vehicle).chain()))
     residual = measured - predicted
     used = measurement.used & np.isfinite(residual[:, measurement.axes[-1]])
     mse, mse_linear = (np.mean(r[used] ** 2, axis=0) for r in (residual, measured - linear))
-    floor = _heading_noise(measurement)
+    floor = heading_noise(measurement)
     axes = tuple(
         AxisError(
             "xyz"[i], float(np.sqrt(mse[i])), float(floor[i]), _share(mse[i], mse_linear[i], floor[i] ** 2)
@@ -73,10 +73,10 @@ def waterfall(
 
 
 def _predicted(measurement: Measurement, motion: Motion, chain: Chain) -> np.ndarray:
-    return _heading_acceleration(motion, measurement.see(specific_force(act(motion, chain))))
+    return heading_acceleration(motion, measurement.see(specific_force(act(motion, chain))))
 
 
-def _heading_acceleration(motion: Motion, force: np.ndarray) -> np.ndarray:
+def heading_acceleration(motion: Motion, force: np.ndarray) -> np.ndarray:
     """Acceleration (N, 3), heading frame, of a specific force (N, 3), body; only z, unrotated, without attitude."""
     if motion.rotation is None:
         out = np.full_like(force, np.nan)
@@ -85,7 +85,7 @@ def _heading_acceleration(motion: Motion, force: np.ndarray) -> np.ndarray:
     return np.einsum("nij,nj->ni", motion.rotation, force) - [0.0, 0.0, GRAVITY]
 
 
-def _heading_noise(measurement: Measurement) -> np.ndarray:
+def heading_noise(measurement: Measurement) -> np.ndarray:
     """Noise RMS (3,), heading frame: yaw leaves x and y of the body in their plane, tilt is small on average."""
     plane = np.sqrt(np.mean(measurement.noise[:2] ** 2))
     return np.array([plane, plane, measurement.noise[2]])

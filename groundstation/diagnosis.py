@@ -27,7 +27,7 @@ from groundstation.fitting import (
 from groundstation.measurement import Measurement, measure
 from groundstation.remainder import unexplained
 from groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
-from models.effect import Effect
+from models.effect import Effect, Stage
 from models.effects import catalogue, effect_named
 from models.flight import Flight
 from models.model import Model, Term
@@ -69,11 +69,15 @@ def diagnose(
 ) -> Diagnosis:
     """Find the effects that `base` lacks on `flight`, checked on held-out blocks and on `validation`.
 
+    A network of `base` is held as it is: what it has learnt is not missing any more.
+
     Raises `InputError` where the flight lacks the columns for any comparison, or is too short.
     """
     measurement = measure(flight, bandwidth)
     held_out = None if validation is None else measure(validation, bandwidth)
-    search = _Search(Problem((measurement,), base.effects_directory), base, held_out, progress)
+    search = _Search(
+        Problem((measurement,), base.effects_directory, base.network_chain()), base, held_out, progress
+    )
     return search.run()
 
 
@@ -84,7 +88,9 @@ class _Search:
         self, problem: Problem, base: Model, held_out: Measurement | None, progress: Callable[[str], None]
     ) -> None:
         self.problem, self.base, self.progress = problem, base, progress
-        self.held_out = None if held_out is None else Problem((held_out,), base.effects_directory)
+        self.held_out = (
+            None if held_out is None else Problem((held_out,), base.effects_directory, base.network_chain())
+        )
         self.blocks = problem.blocks()
         self.known = catalogue(base.effects_directory)
         self.candidates = [n for n in self.known if n not in base.names() and self._measurable(self.known[n])]
@@ -395,7 +401,8 @@ class _Search:
         """Mean squared error of the base model as it stands, nothing refitted but the clock."""
         problem = problem or self.problem
         chain = with_clock(problem.measurements[0], self.base.chain())
-        return float(np.mean((problem.measured() - problem.predict(chain)) ** 2))
+        alone = [(effect, values) for effect, values in chain if effect.stage is not Stage.REMAINDER]
+        return float(np.mean((problem.measured() - problem.predict(alone)) ** 2))
 
     def _estimates(self, fitted: Fit, name: str) -> tuple[ParameterEstimate, ...]:
         return tuple(

@@ -55,10 +55,14 @@ class Free:
 
 @dataclass(frozen=True)
 class Problem:
-    """Measured flights and, for each, the motion that effects act on."""
+    """Measured flights and, for each, the motion that effects act on.
+
+    `always` acts in every prediction and is never fitted: the network of a model.
+    """
 
     measurements: tuple[Measurement, ...]
     effects_directory: str | None = None
+    always: Chain = ()
 
     @property
     def vehicle(self) -> Vehicle:
@@ -69,7 +73,7 @@ class Problem:
         """Predicted specific force (K, A) of the used samples of all flights, behind each flight's filter."""
         parts = []
         for m, motion in zip(self.measurements, self._motions, strict=True):
-            force = m.see(specific_force(act(motion, chain)))
+            force = m.see(specific_force(act(motion, [*chain, *self.always])))
             parts.append(force[m.used][:, m.axes])
         return np.concatenate(parts)
 

@@ -33,8 +33,8 @@ class Measurement:
 
     `value` (M, 3) is specific force in body axes, m/s², low-passed at `bandwidth` Hz and thinned to the rows
     `rows` of the flight; `used` (M,) marks the ones that count; `t` (M,) in s; `see` passes a predicted
-    specific force (N, 3) through the same filter and thinning; `noise` (3,) is the RMS that sensor noise
-    alone leaves; `axes` the body axes that the flight measures.
+    specific force (N, 3) through the same filter and thinning, `smooth` any other columns (N, k) through the
+    low-pass; `noise` (3,) is the RMS that sensor noise alone leaves; `axes` the body axes that the flight measures.
     """
 
     flight: Flight
@@ -43,6 +43,7 @@ class Measurement:
     value: np.ndarray
     used: np.ndarray
     see: Callable[[np.ndarray], np.ndarray]
+    smooth: Callable[[np.ndarray], np.ndarray]
     bandwidth: float
     noise: np.ndarray
     axes: tuple[int, ...]
@@ -84,6 +85,9 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
             out[piece] = signal.sosfiltfilt(sos, x[piece], axis=0, padlen=min(len(x[piece]) - 1, int(fs)))
         return out
 
+    def smooth(x: np.ndarray) -> np.ndarray:
+        return low_pass(x)[rows]
+
     if differentiate:
         quaternion = flight.quaternion[rows]  # type: ignore[index]
 
@@ -104,7 +108,7 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
     else:
 
         def see(force: np.ndarray) -> np.ndarray:
-            return low_pass(force)[rows]
+            return smooth(force)
 
         value = see(raw)
     used, left_out = _used(flight, bandwidth)
@@ -115,6 +119,7 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
         value=value,
         used=used[rows],
         see=see,
+        smooth=smooth,
         bandwidth=bandwidth,
         noise=_noise(raw, used, sos, fs, differentiate),
         axes=(0, 1, 2) if flight.quaternion is not None else (2,),

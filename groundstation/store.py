@@ -75,6 +75,8 @@ def save(store: Path, model: Model, parent: Model | None) -> tuple[Model, Path]:
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
     last = model.terms[-1].effect if model.terms else "linear"
+    if model.network is not None:
+        last = "network"
     path = folder / f"v{number:04d}-{last}.json"
     write_model(stamped, path)
     return stamped, path
@@ -82,6 +84,8 @@ def save(store: Path, model: Model, parent: Model | None) -> tuple[Model, Path]:
 
 def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: float | None = None) -> Model:
     """`base` with one more effect, every parameter refitted to `flights`; not yet saved.
+
+    A network of `base` is dropped: it was trained on what the effects without this one leave over.
 
     Raises `InputError` for an effect that is there already, acts only through one that is not, or needs columns that
     a flight lacks.
@@ -99,12 +103,14 @@ def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: f
         if "rigid_body" in base.names() or effect == "rigid_body"
         else (Term("rigid_body", {}), *base.terms)
     )
-    return refit(base.with_terms((*terms, Term(effect, {}))), flights, bandwidth)
+    return refit(base.with_network(None).with_terms((*terms, Term(effect, {}))), flights, bandwidth)
 
 
 def refit(model: Model, flights: Sequence[Flight], bandwidth: float | None = None) -> Model:
-    """The model with every parameter fitted anew to `flights`."""
-    problem = Problem(tuple(measure(f, bandwidth) for f in flights), model.effects_directory)
+    """The model with every parameter fitted anew to `flights`, beside its network where it has one."""
+    problem = Problem(
+        tuple(measure(f, bandwidth) for f in flights), model.effects_directory, model.network_chain()
+    )
     fitted = fit(problem, model.terms)
     rms = float((fitted.sse / fitted.residual.size) ** 0.5)
     hashes = "+".join(f.data_hash for f in flights)

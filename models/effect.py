@@ -24,9 +24,10 @@ class Stage(IntEnum):
     COMMAND = 0  # on the history of the command
     THRUST = 1  # on the magnitude of the thrust
     ROTATION = 2  # on its direction
-    AIR = 3  # on the velocity of the air
-    FORCE = 4  # on the other forces
-    SENSOR = 5  # on the reading, not on the vehicle
+    REMAINDER = 3  # on the acceleration: what is learnt, from the vehicle's own state
+    AIR = 4  # on the velocity of the air
+    FORCE = 5  # on the other forces
+    SENSOR = 6  # on the reading, not on the vehicle
 
 
 @dataclass(frozen=True)

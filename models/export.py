@@ -6,15 +6,18 @@ import io
 import json
 import logging
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 import onnx
 import torch
 
 from models import contract
+from models.export_graph import simplify
 from models.features import feature_matrix, feature_names, features_of_flight
 from models.flight import Flight
 from models.model import Model
+from models.network import folded_layers
 from models.prediction import error_acceleration, motion_of_features
 
 GOLDEN = 8
@@ -22,30 +25,56 @@ GOLDEN = 8
 
 
 class Correction(torch.nn.Module):
-    """`delta` (N, 3) of features (N, F): the chain of effects minus the hover linearisation, heading frame, m/s²."""
+    """`delta` (N, 3) of features (N, F): effects and network minus the hover linearisation, heading frame, m/s².
+
+    All scaling of the network is inside its weights, and raw features go in: a few microseconds of inference.
+    """
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
         super().__init__()
         self.names, self.vehicle = names, model.vehicle
         self.chain = [
             (effect, {k: float(v) for k, v in values.items()})
-            for effect, values in model.chain()
+            for effect, values in model.effect_chain()
             if effect.exports and effect.name != "accelerometer_bias"
         ]
+        self.network: torch.nn.Module | None = None
+        if model.network is not None:
+            self.network = sequential(folded_layers(model.network, names))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Error acceleration of each row."""
+        learnt = None if self.network is None else self.network(features)
+        if not self.chain and learnt is not None:
+            return learnt
         columns = {name: features[:, i] for i, name in enumerate(self.names)}
-        return error_acceleration(motion_of_features(columns, self.vehicle), self.chain)
+        known = error_acceleration(motion_of_features(columns, self.vehicle), self.chain)
+        return known if learnt is None else known + learnt
+
+
+def sequential(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Sequential:
+    """Layers as torch trains and exports them, with rectified linear units between."""
+    modules: list[torch.nn.Module] = []
+    for weights, biases in layers:
+        if modules:
+            modules.append(torch.nn.ReLU())
+        linear = torch.nn.Linear(weights.shape[1], weights.shape[0])
+        with torch.no_grad():
+            linear.weight.copy_(torch.tensor(weights))
+            linear.bias.copy_(torch.tensor(biases))
+        modules.append(linear)
+    return torch.nn.Sequential(*modules)
 
 
 def not_exported(model: Model) -> tuple[str, ...]:
     """Effects of the model that a static correction cannot hold: those with memory, and errors of the sensor."""
-    return tuple(e.name for e, _ in model.chain() if not e.exports or e.name == "accelerometer_bias")
+    return tuple(e.name for e, _ in model.effect_chain() if not e.exports or e.name == "accelerometer_bias")
 
 
 def export_onnx(model: Model, flight: Flight) -> bytes:
-    """The model as an ONNX file, its training range and golden vectors taken from `flight`.
+    """The model as an ONNX file, effects and network in one graph, with golden vectors taken from `flight`.
+
+    The training range is the network's own, and that of `flight` where there is no network.
 
     Raises `InputError` where the flight lacks position, velocity, attitude or command.
     """
@@ -57,6 +86,19 @@ def export_onnx(model: Model, flight: Flight) -> bytes:
     with torch.no_grad():
         golden = module(torch.from_numpy(table[rows])).numpy()
     units = {**contract.FEATURES, **contract.YAW_FEATURES}
+    low, high = (
+        dict(zip(names, table.min(axis=0), strict=True)),
+        dict(zip(names, table.max(axis=0), strict=True)),
+    )
+    data_hash = model.data_hash or flight.data_hash
+    links: list[dict[str, object]] = [{"effect": e.name, "parameters": v} for e, v in module.chain]
+    if (network := model.network) is not None:
+        low.update(zip(network.features, network.low, strict=True))
+        high.update(zip(network.features, network.high, strict=True))
+        data_hash = network.data_hash
+        links.append(
+            {"effect": "network", "parameters": {"hash": network.hash, "layers": list(network.widths)}}
+        )
     metadata = {
         contract.KEY_CONTRACT: contract.CONTRACT_VERSION,
         contract.KEY_NAME: model.name or model.label,
@@ -73,14 +115,14 @@ def export_onnx(model: Model, flight: Flight) -> bytes:
                 {
                     "name": n,
                     "unit": units[n],
-                    "low": float(table[:, i].min()),
-                    "high": float(table[:, i].max()),
+                    "low": float(low[n]),
+                    "high": float(high[n]),
                 }
-                for i, n in enumerate(names)
+                for n in names
             ]
         ),
-        contract.KEY_CHAIN: json.dumps([{"effect": e.name, "parameters": v} for e, v in module.chain]),
-        contract.KEY_DATA_HASH: model.data_hash or flight.data_hash,
+        contract.KEY_CHAIN: json.dumps(links),
+        contract.KEY_DATA_HASH: data_hash,
         contract.KEY_GOLDEN_FEATURES: json.dumps(table[rows].tolist()),
         contract.KEY_GOLDEN_DELTA: json.dumps(golden.tolist()),
     }
@@ -91,14 +133,18 @@ def _graph(module: torch.nn.Module, example: np.ndarray) -> onnx.ModelProto:
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        program = torch.onnx.export(
+        traced = torch.export.export(
             module,
             (torch.from_numpy(example),),
+            dynamic_shapes={"features": {0: torch.export.Dim("N", min=1)}},
+        )
+        program = torch.onnx.export(
+            simplify(traced),
+            (),
             dynamo=True,
             verbose=False,
             input_names=[contract.INPUT_NAME],
             output_names=[contract.OUTPUT_NAME],
-            dynamic_shapes={"features": {0: torch.export.Dim("N", min=1)}},
         )
     assert program is not None
     return program.model_proto

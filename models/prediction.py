@@ -76,7 +76,8 @@ def motion_of_features(columns: Mapping[str, Array], vehicle: Vehicle) -> Motion
         force=nothing,
         reading=nothing,
         rotation=rotation,
-        euler=(xp.atan2(sp, cp), xp.atan2(st, ct)),
+        # beyond 90 degrees there is no hover to linearise
+        euler=(xp.asin(xp.clip(sp, -1.0, 1.0)), xp.asin(xp.clip(st, -1.0, 1.0))),
         air_velocity=xp.stack([columns["vx"], columns["vy"], columns["vz"]], axis=-1),
         cos_yaw=columns.get("cos_psi", one),
         sin_yaw=columns.get("sin_psi", zero),
@@ -98,7 +99,7 @@ def act(motion: Motion, chain: Chain) -> Motion:
         motion = effect.apply(motion, values)
     if motion.euler is not None:
         motion = motion.with_(thrust_acceleration=linear_thrust(motion))
-    stages = (Stage.ROTATION, Stage.AIR, Stage.FORCE, Stage.SENSOR)
+    stages = (Stage.ROTATION, Stage.REMAINDER, Stage.AIR, Stage.FORCE, Stage.SENSOR)
     # without attitude there is nothing to rotate: thrust is compared along the body's axis
     for stage in stages if motion.euler is not None else stages[1:]:
         for effect, values in at[stage]:

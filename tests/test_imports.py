@@ -19,7 +19,7 @@ ALLOWED = {
     },
     "sim_bridge": {"sim_bridge", "companion", "mujoco", "pymavlink", "scipy", "mcap", "google", "onnxruntime"},
 }  # fmt: skip
-FITS_OR_EXPORTS = {"models/export.py": {"torch", "onnx"}}
+FITS_OR_EXPORTS = {"models/export.py": {"torch", "onnx"}, "models/export_graph.py": {"torch"}}
 """The modules of models/ that may import torch: they fit, train or export, on the ground."""
 
 

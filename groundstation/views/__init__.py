@@ -4,6 +4,17 @@ from groundstation.views.before_after import write_before_after
 from groundstation.views.comparison import write_comparison
 from groundstation.views.monitor import monitor
 from groundstation.views.tracking import write_tracking
+from groundstation.views.training import write_ablation, write_training
+from groundstation.views.tube import write_tube
 from groundstation.views.where import write_where
 
-__all__ = ["monitor", "write_before_after", "write_comparison", "write_tracking", "write_where"]
+__all__ = [
+    "monitor",
+    "write_ablation",
+    "write_before_after",
+    "write_comparison",
+    "write_tracking",
+    "write_training",
+    "write_tube",
+    "write_where",
+]
