@@ -202,19 +202,20 @@ class Guard:
         self.wants_yaw = any(one.wants_yaw for one in self._weights)
 
     def _fade(self, dt: float) -> None:
-        """Move the weights: all down, but the live one's up into what the others leave of one."""
+        """Move the weights: what leaves gives up as much, all together, as the live one may take."""
         change = dt / self.limits.fade
-        others = 0.0
+        live = self._live if self._running else None
+        leaving = sum(weight for watch, weight in self._weights.items() if watch is not live)
+        keep = 1.0 - change / leaving if leaving > change else 0.0
         for watch, weight in list(self._weights.items()):
-            if self._running and watch is self._live:
+            if watch is live:
                 continue
-            self._weights[watch] = weight = max(0.0, weight - change)
-            others += weight
-            if weight == 0.0 and watch is not self._live:
+            if keep * weight > 0.0 or watch is self._live:
+                self._weights[watch] = keep * weight
+            else:
                 del self._weights[watch]
-        live = self._live
-        if self._running and live is not None and not live.tripped:
-            self._weights[live] = min(1.0 - others, self._weights[live] + change)
+        if live is not None and not live.tripped:
+            self._weights[live] = min(1.0 - keep * leaving, self._weights[live] + change)
 
     def _drop(self, watch: Watch) -> None:
         """A model tripped: it is out, and where it was the live one, the last good one takes over."""

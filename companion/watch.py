@@ -39,8 +39,9 @@ class GuardLimits:
     `authority` m/s² and `slew` m/s³ per axis of the heading frame. A raw value beyond `absurd` times the
     authority trips; one beyond the authority is cut and trips after `patience` s without a pause. Outside the
     training range the correction is scaled down, to nothing at `margin` times the range's width, and trips
-    after `patience` s beyond. `deadline` s for one inference: `misses` late ones in a row trip, as does a single
-    one of more than `stall` s. One late inference alone says more of the operating system than of the model.
+    after `patience` s beyond. `deadline` s for the inferences of one tick: `misses` late ones in a row trip, as
+    does a single one of more than `stall` s. One late inference alone says more of the operating system than of
+    the model.
     `fade` s from nothing to full effect and back, and from one model to another.
     """
 
@@ -106,56 +107,69 @@ class Watch:
         `features` may be longer than the model's: those come first. `dt` s since the last call, finite and not
         negative. After a trip both are zero and the model is not called.
         """
-        self.inference_time = 0.0
-        if self.reason:
-            return ZERO, ZERO
-        features = features[: len(self._ranges)]
-        begin = self._clock()
-        try:
-            x, y, z = self._model(features)
-            raw = (float(x), float(y), float(z))
-        except Exception as error:  # noqa: BLE001 - whatever a model raises, the flight goes on without it
-            return self.trip(f"the model raised {type(error).__name__}"), ZERO
-        self.inference_time = self._clock() - begin
-        if not (math.isfinite(raw[0]) and math.isfinite(raw[1]) and math.isfinite(raw[2])):
-            return self.trip("the model returned a number that is not finite"), ZERO
-        if not self._in_time(self.inference_time):
-            return raw, self.trip(f"inference took {1e3 * self.inference_time:.1f} ms")
-        a, b, c = self.limits.authority
-        excess = max(abs(raw[0]) / a, abs(raw[1]) / b, abs(raw[2]) / c)
-        if excess > self.limits.absurd:
-            return raw, self.trip(f"a correction {excess:.0f} times its authority")
-        self._saturated = self._saturated + dt if excess > 1.0 else 0.0
-        if self._saturated > self.limits.patience:
-            return raw, self.trip(f"beyond its authority for {self.limits.patience:g} s")
-        trust, name = self._trusted(features)
-        self.trust = trust
-        self._outside = self._outside + dt if trust == 0.0 else 0.0
-        if self._outside > self.limits.patience:
-            return raw, self.trip(f"{name} outside its training range for {self.limits.patience:g} s")
-        return raw, (trust * _within(raw[0], a), trust * _within(raw[1], b), trust * _within(raw[2], c))
+        return self._judged((features,), dt)[0]
 
     def look(self, rows: Sequence[Sequence[float]], ahead: float, dt: float) -> Look:
         """What the model says for three rows of features: where tilt acts, `ahead` s later, where thrust acts.
 
-        x and y are taken from the first row, z from the third, the rate from the first two.
+        x and y are taken from the first row, z from the third, the rate from the first two. The three count as
+        one inference.
         """
-        raw, now = self.evaluate(rows[0], dt)
-        trust, seconds = self.trust, self.inference_time
-        _, later = self.evaluate(rows[1], 0.0)
-        seconds += self.inference_time
-        lifting, lifted = self.evaluate(rows[2], 0.0)
-        self.inference_time += seconds
-        if self.reason:
-            return Look((raw[0], raw[1], lifting[2]), ZERO, (0.0, 0.0))
-        self.trust = min(trust, self.trust)
+        (raw, now), (_, later), (lifting, lifted) = self._judged(rows, dt)
         rate = ((later[0] - now[0]) / ahead, (later[1] - now[1]) / ahead)
         return Look((raw[0], raw[1], lifting[2]), (now[0], now[1], lifted[2]), rate)
 
-    def trip(self, reason: str) -> Vector:
-        """Give up on the model for `reason`; what may act from now on: nothing."""
+    def _judged(self, rows: Sequence[Sequence[float]], dt: float) -> list[tuple[Vector, Vector]]:
+        """Raw answer and what of it may act for each row; where anything is wrong with one, nothing of all."""
+        self.inference_time = 0.0
+        nothing = [(ZERO, ZERO) for _ in rows]
+        if self.reason:
+            return nothing
+        rows = [features[: len(self._ranges)] for features in rows]
+        raws: list[Vector] = []
+        begin = self._clock()
+        try:
+            for features in rows:
+                x, y, z = self._model(features)
+                raws.append((float(x), float(y), float(z)))
+        except Exception as error:  # noqa: BLE001 - whatever a model raises, the flight goes on without it
+            self.trip(f"the model raised {type(error).__name__}")
+            return nothing
+        self.inference_time = self._clock() - begin
+        if not all(math.isfinite(x) and math.isfinite(y) and math.isfinite(z) for x, y, z in raws):
+            self.trip("the model returned a number that is not finite")
+            return nothing
+        trusts = [self._trusted(features) for features in rows]
+        self.trust, worst = min(trusts)
+        self._limit(raws, worst, dt)
+        if self.reason:
+            return [(raw, ZERO) for raw in raws]
+        a, b, c = self.limits.authority
+        return [
+            ((x, y, z), (trust * _within(x, a), trust * _within(y, b), trust * _within(z, c)))
+            for (x, y, z), (trust, _) in zip(raws, trusts, strict=True)
+        ]
+
+    def _limit(self, raws: Sequence[Vector], worst: str, dt: float) -> None:
+        """Trip on finite answers that come late, are too large, or come from outside the training range."""
+        limits = self.limits
+        if not self._in_time(self.inference_time):
+            self.trip(f"inference took {1e3 * self.inference_time:.1f} ms")
+            return
+        a, b, c = limits.authority
+        excess = max(max(abs(x) / a, abs(y) / b, abs(z) / c) for x, y, z in raws)
+        self._saturated = self._saturated + dt if excess > 1.0 else 0.0
+        self._outside = self._outside + dt if self.trust == 0.0 else 0.0
+        if excess > limits.absurd:
+            self.trip(f"a correction {excess:.0f} times its authority")
+        elif self._saturated > limits.patience:
+            self.trip(f"beyond its authority for {limits.patience:g} s")
+        elif self._outside > limits.patience:
+            self.trip(f"{worst} outside its training range for {limits.patience:g} s")
+
+    def trip(self, reason: str) -> None:
+        """Give up on the model for `reason`."""
         self.reason, self.trust = reason, 0.0
-        return ZERO
 
     def _in_time(self, seconds: float) -> bool:
         self._late = self._late + 1 if seconds > self.limits.deadline else 0

@@ -29,11 +29,18 @@ class Clock:
 
 def guard_of(model, limits=LIMITS, trips=None, clock=None) -> Guard:
     kwargs = {} if clock is None else {"clock": clock}
-    return Guard(model, RANGES, limits, on_trip=None if trips is None else lambda name, why: trips.append(why), **kwargs)
+    on_trip = None if trips is None else lambda name, why: trips.append(why)
+    return Guard(model, RANGES, limits, on_trip=on_trip, **kwargs)
+
+
+def step(guard: Guard, features, dt: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """One tick with the same features at each of the moments that the controller asks for."""
+    correction = guard.step([features] * 3, 0.02, dt)
+    return correction.applied, correction.raw
 
 
 def run(guard: Guard, seconds: float, features=INSIDE) -> list[tuple[float, float, float]]:
-    return [guard.step(features, DT)[0] for _ in range(round(seconds / DT))]
+    return [step(guard, features, DT)[0] for _ in range(round(seconds / DT))]
 
 
 def constant(x: float, y: float = 0.0, z: float = 0.0):
@@ -82,12 +89,12 @@ def test_the_applied_correction_never_leaves_its_envelope(ticks) -> None:
         script.append((answer, seconds))
         if order:
             getattr(guard, order)()
-        applied, _ = guard.step(features, dt)
-        step = min(0.1, dt) if dt > 0 else 0.0
+        applied, _ = step(guard, features, dt)
+        longest = min(0.1, dt) if dt > 0 else 0.0
         for i in range(3):
             assert math.isfinite(applied[i])
             assert abs(applied[i]) <= LIMITS.authority[i]
-            assert abs(applied[i] - previous[i]) <= LIMITS.slew[i] * step + 1e-9
+            assert abs(applied[i] - previous[i]) <= LIMITS.slew[i] * longest + 1e-9
         previous = applied
     assert len(trips) <= 1, "a trip is told once"
     assert bool(trips) == guard.tripped
@@ -165,7 +172,7 @@ def test_nonsense_trips_at_once_and_for_good(model, reason: str) -> None:
 
     def counted(features):
         calls.append(1)
-        return (1.0, 0.0, 0.0) if len(calls) < 100 else model(features)
+        return (1.0, 0.0, 0.0) if len(calls) <= 99 * 3 else model(features)  # three moments a tick
 
     guard = guard_of(counted, trips=trips)
     guard.start()
@@ -181,7 +188,7 @@ def test_nonsense_trips_at_once_and_for_good(model, reason: str) -> None:
     guard.stop()
     assert run(guard, 0.5)[-1] == (0.0, 0.0, 0.0)
     assert guard.tripped
-    assert len(calls) == 100, "a tripped model is not called again"
+    assert 99 * 3 < len(calls) <= 100 * 3, "a tripped model is not called again"
 
 
 def test_a_late_model_trips_after_some_misses_and_a_very_late_one_at_once() -> None:
@@ -189,30 +196,30 @@ def test_a_late_model_trips_after_some_misses_and_a_very_late_one_at_once() -> N
     delay = [0.0]
 
     def model(features):
-        clock.now += delay[0]
+        clock.now += delay[0] / 3.0  # three moments a tick
         return (0.1, 0.0, 0.0)
 
     guard = guard_of(model, clock=clock)
     guard.start()
     for _ in range(3):  # single misses are forgiven
         delay[0] = 1.5 * LIMITS.deadline
-        guard.step(INSIDE, DT)
+        step(guard, INSIDE, DT)
         delay[0] = 0.0
-        guard.step(INSIDE, DT)
+        step(guard, INSIDE, DT)
     assert not guard.tripped
     delay[0] = 1.5 * LIMITS.deadline
     for _ in range(LIMITS.misses - 1):
-        guard.step(INSIDE, DT)
+        step(guard, INSIDE, DT)
     assert not guard.tripped
     assert guard.inference_time == pytest.approx(1.5 * LIMITS.deadline)
-    guard.step(INSIDE, DT)
+    step(guard, INSIDE, DT)
     assert guard.tripped
     assert "inference took" in guard.status
 
     at_once = guard_of(model, clock=clock)
     at_once.start()
     delay[0] = 1.1 * LIMITS.stall
-    at_once.step(INSIDE, DT)
+    step(at_once, INSIDE, DT)
     assert at_once.tripped
 
 
@@ -257,7 +264,7 @@ def test_a_feature_that_hardly_moved_in_training_has_a_margin_of_its_unit() -> N
 def test_a_gap_gives_no_jump() -> None:
     guard = guard_of(constant(2.0), GuardLimits(fade=0.01))
     guard.start()
-    applied, _ = guard.step(INSIDE, 100.0)
+    applied, _ = step(guard, INSIDE, 100.0)
     assert applied[0] <= LIMITS.slew[0] * 0.1
-    assert guard.step(INSIDE, -1.0)[0] == applied
-    assert guard.step(INSIDE, math.nan)[0] == applied
+    assert step(guard, INSIDE, -1.0)[0] == applied
+    assert step(guard, INSIDE, math.nan)[0] == applied
