@@ -44,9 +44,9 @@ FULL = BatteryState()
 def in_state(cell: BatteryCell, state: BatteryState) -> BatteryCell:
     """The battery at a charge and an age.
 
-    A lithium-ion cell is commonly called worn out where its resistance has doubled or a fifth of its capacity is
-    gone (Barré et al., "A review on lithium-ion battery ageing mechanisms and estimations for automotive
-    applications", J. Power Sources 241, 2013); both are taken to come together, in proportion.
+    A lithium-ion cell is commonly retired where its resistance has doubled or a fifth of its capacity is gone
+    (TWAICE, Battery Encyclopedia, "End of life": 80 % state of health or 200 % of the ohmic resistance); both are
+    taken to come together, in proportion.
     """
     return replace(
         cell,

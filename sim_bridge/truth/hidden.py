@@ -442,17 +442,14 @@ RICH: dict[str, tuple[float, float]] = {
 def rich(vehicle: Vehicle, seed: int) -> tuple[Hidden, ...]:
     """Everything at once that a real 5-inch quadrotor does and its linear design does not know.
 
-    Magnitudes from measurements of such vehicles, drawn by the seed:
+    Magnitudes of the order known of such vehicles, drawn by the seed:
 
-    * rotor drag in 1/s: 0.3 to 0.5 along the axes (Faessler, Franchi, Scaramuzza, RA-L 2018, table I), 0.35 for
-      0.75 kg (Sun et al., "A comparative study of nonlinear MPC and differential-flatness-based control", T-RO
-      2022); part of either is the frame's, which is drawn separately.
-    * parasitic drag in 1/m: drag areas of 0.012 to 0.037 m² (Hoerner 1965: a bluff body of that frontal area).
-    * ground effect: radii of 1.2 to 2 propellers (Sanchez-Cuenca et al. 2017; Powers et al., "Influence of
-      aerodynamics and proximity effects in quadrotor flight", ISER 2012).
+    * rotor drag, some tenths of 1/s: Faessler, Franchi, Scaramuzza, RA-L 2018, identify it in flight.
+    * parasitic drag: drag areas of 0.012 to 0.037 m² at 0.75 kg, a bluff body of that frontal area (Hoerner 1965).
+    * ground effect: effective radii of 1.2 to 2 propellers (Sanchez-Cuenca et al. 2017).
     * battery: thrust goes with the square of the voltage of an unloaded motor and with less of a loaded one.
-    * rotor lag: 33 to 40 ms (Foehn et al., "Agilicious", Science Robotics 2022), against 20 ms of the bench.
-    * thrust curve: PX4's THR_MDL_FAC of 0.3 to 0.6 in the neighbourhood of hover.
+    * rotor lag: 28 to 40 ms on the vehicle, against the 20 ms of the bench.
+    * thrust curve: of PX4's model thrust = (1 - f) u + f u² (THR_MDL_FAC) with f of 0.3 to 0.6, near hover.
     * thrust gain: what a hover command read off a log, a scale and another set of propellers leave open.
     * estimator delay: 8 to 12 ms from motion to message, motion capture and filters included.
 
