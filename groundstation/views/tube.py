@@ -13,8 +13,11 @@ from groundstation.views import scene
 from groundstation.views.colour import FLOOR, LINEAR, NEWEST, REFERENCE
 from groundstation.views.recording import TIME, curve, recording, text, thin
 
-RINGS = 60
-"""Balls drawn along the reference at most; more hide the path."""
+BALLS = 60
+"""Balls drawn along the middle of the tube at most; more hide the path."""
+WIDEST = 0.25
+"""Half width of a tube, in sizes of the scene, beyond which it would hide the path: then only the ball of the moment
+is drawn."""
 
 
 def write_tube(path: Path, tube: Tube) -> None:
@@ -55,7 +58,7 @@ def _blueprint(stream: rr.RecordingStream, tube: Tube) -> rrb.Blueprint:
     space = rrb.Spatial3DView(
         origin="space",
         name=f"flown (blue) and the ball around the {tube.disturbance.around} (green)",
-        eye_controls=scene.eye(tube.position, 1.1),
+        eye_controls=scene.eye(np.concatenate([tube.position, tube.reference + tube.centre[:, :, 0]]), 1.1),
         line_grid=scene.ground(),
     )
     return rrb.Blueprint(
@@ -114,18 +117,16 @@ def _log_space(stream: rr.RecordingStream, tube: Tube, clock: np.ndarray) -> Non
     stream.log("space", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     scene.log_line(stream, "space/flown", tube.position, NEWEST, 0.006 * size)
     scene.log_line(stream, "space/middle", middle, REFERENCE, 0.003 * size)
-    some = thin(len(clock), RINGS)
+    some = thin(len(clock), BALLS)
     half = tube.extent[:, :, 0]
-    stream.log(
-        "space/tube",
-        rr.Ellipsoids3D(
-            centers=middle[some],
-            half_sizes=half[some],
-            colors=[(*REFERENCE, 10)],
-            fill_mode="solid",
-        ),
-        static=True,
-    )
+    if half.max() < WIDEST * size:
+        stream.log(
+            "space/tube",
+            rr.Ellipsoids3D(
+                centers=middle[some], half_sizes=half[some], colors=[(*REFERENCE, 10)], fill_mode="solid"
+            ),
+            static=True,
+        )
     outside = np.any(tube.level > tube.predicted + tube.resolution, axis=1)
     if outside.any():
         points = tube.position[outside][thin(int(outside.sum()), 500)]
@@ -156,9 +157,10 @@ def _summary(tube: Tube) -> str:
     lines += ["", f"Around the {tube.disturbance.around}; bound from {Path(tube.bound_from).name}."]
     if len(tube.jumps):
         lines.append(f"The reference jumps {len(tube.jumps)} times; the tube widens there by as much.")
+    lines += ["", f"The sensors resolve {tube.resolution.max():.2f} m/s².", ""]
     lines += [
-        f"**Leaves the tube** in {leaving.axis} at t = {leaving.start - tube.t[0]:.2f} s for "
-        f"{leaving.end - leaving.start:.2f} s."
+        f"- **leaves the tube** in {leaving.axis} at t = {leaving.start - tube.t[0]:.2f} s for "
+        f"{leaving.end - leaving.start:.2f} s"
         for leaving in tube.leavings[:6]
     ] or ["The flight never leaves the tube."]
     return "\n".join(lines)

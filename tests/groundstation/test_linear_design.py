@@ -14,9 +14,10 @@ from scipy.integrate import solve_ivp
 
 from groundstation.cli import app
 from groundstation.expected import Reference, closed_loop, expected_behaviour
-from groundstation.linear_design import loops, make_design
+from groundstation.integral_design import integral_loops, with_integral
+from groundstation.linear_design import PHASE_MARGIN, loops, make_design
 from groundstation.tracking import track
-from models.design import load_design
+from models.design import design_to_json, load_design
 from models.errors import InputError, run_command_line
 from models.flight import Flight
 from models.frames import heading_from_world, quaternion_from_euler
@@ -73,6 +74,102 @@ def test_the_closed_loop_has_the_poles_of_the_design(design):
         if loop.name in ("horizontal", "vertical"):
             for pole in loop.poles:
                 assert np.abs(poles - pole).min() < 1e-6
+
+
+def integral_flight(design, gains, push, reference, duration):
+    """Position (N, 3) of the linear vehicle with its attitude loop, at yaw 0, from rest at the origin: `gains` are
+    (K_eta, K_i), `push` (3,) a constant acceleration, `reference` (3,) a constant position."""
+    k_zeta, (k_eta, k_i) = np.array(design.K_zeta)[:2, :2], (np.array(g) for g in gains)
+
+    def slope(_, state):
+        p, v, tilt, integral = state[:3], state[3:6], state[6:8], state[8:]
+        u = -k_eta @ np.concatenate([p - reference, v]) - k_i @ integral
+        a = np.array([GRAVITY * tilt[1], -GRAVITY * tilt[0], u[2] / design.mass]) + push
+        return np.concatenate([v, a, -k_zeta @ (tilt - u[:2]), p - reference])
+
+    t = np.arange(0.0, duration, 0.01)
+    return t, solve_ivp(slope, (0, duration), np.zeros(11), t_eval=t, rtol=1e-8, atol=1e-9).y[:3].T
+
+
+@pytest.mark.parametrize("shipped", [True, False])
+def test_the_integral_removes_a_constant_disturbance_in_the_time_stated(design, shipped):
+    if shipped:
+        design = load_design(Path(VEHICLE.source).with_name("design.json"), VEHICLE)
+    else:
+        design = with_integral(design, VEHICLE)
+    found = integral_loops(design, VEHICLE)
+    own = {loop.name: loop for loop in loops(design, VEHICLE)}
+    push = np.array([0.7, -0.4, 0.9])
+    t, lqr = integral_flight(design, (design.K_eta, np.zeros((3, 3))), push, np.zeros(3), 16.0)
+    _, integral = integral_flight(
+        design, (design.integral.K_eta, design.integral.K_i), push, np.zeros(3), 16.0
+    )
+    for axis, loop in ((0, found[0]), (1, found[0]), (2, found[1])):
+        kept = abs(lqr[-1, axis])
+        outside = np.flatnonzero(np.abs(integral[:, axis]) > 0.05 * kept)
+        assert t[outside[-1]] == pytest.approx(loop.removal, abs=0.06)
+        assert np.abs(integral[:, axis]).max() == pytest.approx(loop.peak * kept, rel=0.02)
+        assert loop.removal <= 2.0 * own[loop.loop.name].settling_time + 0.06
+    step = np.array([1.0, 1.0, 1.0])
+    _, lqr = integral_flight(design, (design.K_eta, np.zeros((3, 3))), np.zeros(3), step, 16.0)
+    gains = (design.integral.K_eta, design.integral.K_i)
+    _, integral = integral_flight(design, gains, np.zeros(3), step, 16.0)
+    for axis, loop in ((0, found[0]), (2, found[1])):
+        part = t <= 2.0 * loop.allowed
+        distance = np.sqrt(np.mean((integral - lqr)[part, axis] ** 2))
+        assert distance == pytest.approx(loop.step_distance, rel=0.05)
+
+
+def test_the_integral_keeps_bandwidth_and_margin_of_the_lqr(design):
+    own = {loop.name: loop for loop in loops(design, VEHICLE)}
+    for found in integral_loops(with_integral(design, VEHICLE), VEHICLE):
+        assert found.loop.phase_margin >= PHASE_MARGIN
+        assert found.loop.crossover <= 1.01 * own[found.loop.name].crossover
+        assert max(pole.real for pole in found.loop.poles) < 0
+
+
+def test_no_other_integral_that_does_as_much_is_nearer_to_the_lqr(design):
+    """Against others around it: none that is as fast, with bandwidth and margin kept, comes nearer."""
+    from groundstation.integral_design import REMAINDER, STEP, _axes, _best, _crossover, _responses
+
+    rng = np.random.default_rng(0)
+    for axis in _axes(design, VEHICLE):
+        best, lqr = _best(axis), np.array([axis.p, axis.v, 0.0])
+        samples, after = int(4 * axis.settling / STEP), int(np.ceil(2 * axis.settling / STEP))
+        target, limit = _responses(axis, lqr, samples)[0], _crossover(axis, lqr)[0]
+
+        def distance_and_rest(gains, axis=axis, samples=samples, after=after, target=target):
+            step, _, left = _responses(axis, gains, samples)
+            return np.mean((step - target) ** 2), axis.p * np.abs(left[after:]).max()
+
+        least, rest = distance_and_rest(best)
+        assert rest <= 1.01 * REMAINDER
+        allowed = 0
+        for gains in best * np.exp(rng.normal(scale=0.08, size=(400, 3))):
+            crossover, margin = _crossover(axis, gains)
+            distance, rest = distance_and_rest(gains)
+            if crossover <= limit and margin >= PHASE_MARGIN and rest <= REMAINDER:
+                allowed += 1
+                assert distance > 0.99 * least
+        assert allowed > 10
+
+
+def test_a_design_can_keep_its_gains_and_get_an_integral(tmp_path):
+    shipped = Path(VEHICLE.source).with_name("design.json")
+    plain = replace(load_design(shipped, VEHICLE), integral=None)
+    (tmp_path / "mine.json").write_text(design_to_json(plain))
+    keep = ["--keep", str(tmp_path / "mine.json")]
+    app(["design", VEHICLE.source, *keep, "-o", str(tmp_path / "new.json")], standalone_mode=False)
+    made = load_design(tmp_path / "new.json", VEHICLE)
+    assert replace(made, integral=None) == plain
+    for ours, theirs in zip(
+        (made.integral.K_eta, made.integral.K_i),
+        (load_design(shipped).integral.K_eta, load_design(shipped).integral.K_i),
+        strict=True,
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-9)
+    with pytest.raises(InputError, match="leave out --bandwidth"):
+        app(["design", VEHICLE.source, *keep, "--bandwidth", "0.3"], standalone_mode=False)
 
 
 @pytest.mark.parametrize("yaw_rate", [0.0, 0.4])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import control
 import numpy as np
@@ -72,3 +73,30 @@ def test_garbage_is_told(text: str, tmp_path: Path) -> None:
         load_design(tmp_path / "design.json")
     with pytest.raises(InputError, match="cannot read"):
         load_design(tmp_path / "none.json")
+
+
+def test_a_design_without_integral_is_one_too(tmp_path: Path) -> None:
+    plain = replace(load_design(QUAD5 / "design.json"), integral=None)
+    assert "integral" not in json.loads(design_to_json(plain))
+    save_design(plain, tmp_path / "design.json")
+    assert load_design(tmp_path / "design.json") == plain
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda i: 3, "'integral' must be an object with K_eta and K_i"),
+        (lambda i: {"K_eta": i["K_eta"]}, "'integral' must be an object with K_eta and K_i"),
+        (lambda i: {**i, "limit": 1}, "and nothing else"),
+        (lambda i: {**i, "K_i": [[0, 0, 0]]}, r"'integral\.K_i' must be 3 rows of 3"),
+        (lambda i: {**i, "K_i": (-np.array(i["K_i"])).tolist()}, "integral gives an unstable loop"),
+        (lambda i: {**i, "K_i": (20 * np.array(i["K_i"])).tolist()}, "integral gives an unstable loop"),
+        (lambda i: {**i, "K_i": np.zeros((3, 3)).tolist()}, "integral gives an unstable loop"),
+    ],
+)
+def test_an_integral_that_cannot_fly_is_told(change: Any, message: str, tmp_path: Path) -> None:
+    table = json.loads(design_to_json(load_design(QUAD5 / "design.json")))
+    table["integral"] = change(table["integral"])
+    (tmp_path / "design.json").write_text(json.dumps(table))
+    with pytest.raises(InputError, match=message):
+        load_design(tmp_path / "design.json")
