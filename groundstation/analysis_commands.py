@@ -477,7 +477,10 @@ def _fit_rms(model: Model) -> float:
 def model_export(
     which: Annotated[str, typer.Argument(help="Version number, or the model's JSON file.")],
     flight: Annotated[
-        Path, typer.Option("--flight", help="Flight that gives the training range and golden vectors.")
+        list[Path],
+        typer.Option(
+            "--flight", help="Flight that gives training range, golden vectors and actuation. Repeatable."
+        ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The ONNX file to write.")],
     vehicle: VehicleOption = None,
@@ -487,16 +490,21 @@ def model_export(
 ) -> None:
     """Write a version as one ONNX file with its contract, ready to deploy.
 
+    What the flights show of the rate loop goes with it: the corrected controller looks ahead over it.
+
     Example: groundstation model export v2 --flight identify.csv -o correction.onnx
     """
+    from groundstation.actuation import actuation_of
     from groundstation.store import find
     from models.contract import model_hash
     from models.export import export_onnx, not_exported
 
-    read = _read(flight, vehicle, mapping)
-    model = find(store, read.vehicle.name, which)
-    check_vehicle(model, read)
-    data = export_onnx(model, read)
+    flights = [_read(path, vehicle, mapping) for path in flight]
+    model = find(store, flights[0].vehicle.name, which)
+    for one in flights:
+        check_vehicle(model, one)
+    actuation = actuation_of(model, flights)
+    data = export_onnx(model, *flights, actuation=actuation)
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = output.with_name(output.name + ".part")
     temporary.write_bytes(data)
@@ -504,10 +512,26 @@ def model_export(
     left = not_exported(model)
     if as_json:
         print_json(
-            {"path": str(output), "hash": model_hash(data), "bytes": len(data), "not_exported": list(left)}
+            {
+                "path": str(output),
+                "hash": model_hash(data),
+                "bytes": len(data),
+                "not_exported": list(left),
+                "actuation": actuation,
+            }
         )
         return
     console.print(f"{output}: {model.label}, {len(data) / 1000:.0f} kB, hash {model_hash(data)}")
+    rates = (
+        f"rates {1e3 * actuation['rate_delay']:.0f} ms delay and {1e3 * actuation['rate_lag']:.0f} ms lag"
+        if "rate_lag" in actuation
+        else "nothing of the rate loop (these flights do not show it)"
+    )
+    console.print(
+        f"looks ahead over: thrust {1e3 * actuation['thrust_delay']:.0f} ms delay and "
+        f"{1e3 * actuation['thrust_lag']:.0f} ms lag, {rates}",
+        highlight=False,
+    )
     if left:
         console.print(
             f"not in it, for a static correction has no memory and no sensor: {', '.join(left)}",

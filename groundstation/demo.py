@@ -21,6 +21,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from groundstation.actuation import actuation_of
 from groundstation.compare import compare, waterfall
 from groundstation.diagnosis import diagnose
 from groundstation.link import Link
@@ -285,7 +286,8 @@ def _deploy_and_fly(console: Console, link: Link, folder: Path, model: Model, su
     _step(console, "Deploy", "groundstation model export; groundstation deploy")
     file = folder / "correction.onnx"
     with console.status("exporting to ONNX"):
-        file.write_bytes(export_onnx(model, read_flight(survey)))
+        flight = read_flight(survey)
+        file.write_bytes(export_onnx(model, flight, actuation=actuation_of(model, [flight])))
     answer = link.request("model", file.read_bytes(), 30.0)
     console.print(f"accepted by the companion: {answer.get('reason') or file.name}", highlight=False)
     for effect in not_exported(model):

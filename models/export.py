@@ -6,7 +6,7 @@ import io
 import json
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import onnx
@@ -71,16 +71,21 @@ def not_exported(model: Model) -> tuple[str, ...]:
     return tuple(e.name for e, _ in model.effect_chain() if not e.exports or e.name == "accelerometer_bias")
 
 
-def export_onnx(model: Model, flight: Flight) -> bytes:
-    """The model as an ONNX file, effects and network in one graph, with golden vectors taken from `flight`.
+def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] | None = None) -> bytes:
+    """The model as an ONNX file, effects and network in one graph, with golden vectors taken from `flights`.
 
-    The training range is the network's own, and that of `flight` where there is no network.
+    The training range is the network's own, and that of `flights` where there is no network. `actuation` holds
+    what is known of the path from command to motion, by the names of `models.contract.ACTUATION_LIMITS`.
 
-    Raises `InputError` where the flight lacks position, velocity, attitude or command.
+    Raises `InputError` where a flight lacks position, velocity, attitude or command.
     """
     names = feature_names(model.names())
-    columns = features_of_flight(flight, flight.flying if flight.flying is not None else slice(None))
-    table = feature_matrix(columns, names)
+    table = np.concatenate(
+        [
+            feature_matrix(features_of_flight(f, f.flying if f.flying is not None else slice(None)), names)
+            for f in flights
+        ]
+    )
     module = Correction(model, names).eval()
     rows = np.linspace(0, len(table) - 1, GOLDEN).astype(int)
     with torch.no_grad():
@@ -90,7 +95,7 @@ def export_onnx(model: Model, flight: Flight) -> bytes:
         dict(zip(names, table.min(axis=0), strict=True)),
         dict(zip(names, table.max(axis=0), strict=True)),
     )
-    data_hash = model.data_hash or flight.data_hash
+    data_hash = model.data_hash or "+".join(f.data_hash for f in flights)
     links: list[dict[str, object]] = [{"effect": e.name, "parameters": v} for e, v in module.chain]
     if (network := model.network) is not None:
         low.update(zip(network.features, network.low, strict=True))
@@ -126,6 +131,8 @@ def export_onnx(model: Model, flight: Flight) -> bytes:
         contract.KEY_GOLDEN_FEATURES: json.dumps(table[rows].tolist()),
         contract.KEY_GOLDEN_DELTA: json.dumps(golden.tolist()),
     }
+    if actuation:
+        metadata[contract.KEY_ACTUATION] = json.dumps(dict(actuation))
     return _with_metadata(_graph(module, table[: max(2, GOLDEN)]), metadata)
 
 

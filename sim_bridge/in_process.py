@@ -182,7 +182,13 @@ def _guard(plan: Plan) -> Guard | None:
     if verdict.model is None:
         raise InputError(f"--model: refused: {verdict.reason}")
     info = verdict.model.info
-    return Guard(verdict.model, info.features, wants_yaw=info.wants_yaw, actuation=info.actuation)
+    return Guard(
+        verdict.model,
+        info.features,
+        wants_yaw=info.wants_yaw,
+        clock=time.thread_time,  # what others take from the processor must not decide what a simulated flight becomes
+        actuation=info.actuation,
+    )
 
 
 def _previews(plan: Plan, period: float) -> Iterator[Preview]:
