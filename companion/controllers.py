@@ -32,12 +32,10 @@ from companion.control import (
     features,
 )
 from companion.guard import Correction
+from models.contract import CONTROLLERS, CORRECTED, LQR, LQR_INTEGRAL
 from models.errors import InputError
 from models.trajectory import ReferenceSample
 from models.vehicle import GRAVITY
-
-LQR, LQR_INTEGRAL, CORRECTED = "lqr", "lqr_integral", "corrected"
-CONTROLLERS = (LQR, LQR_INTEGRAL, CORRECTED)
 
 Preview = Callable[[float], ReferenceSample]
 """The reference so many seconds from now; it holds still after its end."""

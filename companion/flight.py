@@ -18,11 +18,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from companion.control import IDLE_STEP, Attitude, ControlLaw, ControlStep, State, euler, features
-from companion.controllers import CONTROLLERS, CORRECTED, Controller, TrimLimits, make_controller
+from companion.controllers import Controller, TrimLimits, make_controller
 from companion.guard import Guard
 from companion.shadow import Shadow, error_acceleration
 from companion.vehicle_link import Latest, Odometry
 from companion.watch import Watch
+from models.contract import CONTROLLERS, CORRECTED
 from models.errors import InputError
 from models.reference import Trajectory, transfer
 from models.trajectory import ReferenceSample, Waypoint

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from companion.control import ControlLaw, ControlStep, State
-from companion.controllers import CORRECTED, LQR, Preview, TrimLimits, make_controller
+from companion.controllers import Preview, TrimLimits, make_controller
 from companion.guard import Guard
 from companion.inference import check_model
+from models.contract import CORRECTED, LQR
 from models.design import Design
 from models.errors import InputError
 from models.flight import COLUMNS
