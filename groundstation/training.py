@@ -25,11 +25,13 @@ from groundstation.training_data import Samples, split
 from models.contract import FEATURES, YAW_FEATURES
 from models.errors import InputError
 from models.export import sequential
-from models.network import Network
+from models.network import Network, error_acceleration_of
 
 WIDTHS = (64, 64)
 """Hidden layers of the paper."""
 CHECKPOINT_SECONDS = 5.0
+MATERIAL_MEMORY = 0.1
+"""Share of the remaining error from which a lag that the base model lacks is told of."""
 _FLOORS = {"m": 0.1, "m/s": 0.2, "V": 0.2, "1": 0.01, "N": 0.1}
 """Least scale of an input, by unit, so that a small step outside the training range stays a small step."""
 
@@ -407,6 +409,21 @@ def _threads(count: int) -> Iterator[None]:
 
 def _three(values: np.ndarray) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
+
+
+def memory_share(samples: Samples, training: Training) -> float:
+    """Part of the held-out squared error in z, 0 to 1, that goes with the rate of change of thrust.
+
+    A static map cannot follow a lag or a delay: to first order what it misses is proportional to that rate.
+    """
+    held = samples.only(training.validation)
+    features = held.with_features(training.network.features).features
+    left = (held.target - error_acceleration_of(training.network, features))[:, 2].astype(float)
+    thrust = held.features[:, held.names.index("T")].astype(float)
+    following = (np.diff(held.t, prepend=-1.0) < 1.5 * held.period) & (np.diff(held.flight, prepend=-1) == 0)
+    rate = np.where(following, np.diff(thrust, prepend=thrust[0]) / held.period, 0.0)
+    power = float(rate @ rate * (left @ left))
+    return float(rate @ left) ** 2 / power if power > 0.0 else 0.0
 
 
 def with_epochs(recipe: Recipe, epochs: int | None) -> Recipe:
