@@ -2,8 +2,8 @@
 
     python benchmarks/training_recipes.py FOLDER... [--seeds 0,1,2] [--recipes default,paper] [--epochs N]
 
-Each FOLDER holds the records of one vehicle (`sim-bridge collect --hidden rich --seed 1 -o FOLDER`). Prints the held-out
-RMS, wall and processor time, and when the first recipe reached the final loss of the last.
+Each FOLDER holds the records of one vehicle (`sim-bridge collect --hidden rich --seed 1 -o FOLDER`). Prints the
+held-out RMS, wall and processor time, and when the first recipe reached the final loss of the last.
 """
 
 from __future__ import annotations
