@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from companion.actuation import Actuation, LagInverse, RateModel
@@ -79,11 +79,11 @@ class Controller(Protocol):
         ...
 
     def start(self) -> None:
-        """The mission's trajectory begins with the next tick."""
+        """The correction, or the mission's trajectory, begins with the next tick."""
         ...
 
     def stop(self) -> None:
-        """The mission's trajectory is over."""
+        """The correction is over."""
         ...
 
 
@@ -91,12 +91,13 @@ class Controller(Protocol):
 class TrimLimits:
     """The slow trim of `corrected`: it removes what is left between the flight and its linear behaviour.
 
-    The integral of the distance to the expected linear behaviour, with `bandwidth` (rad/s, in relation to the
-    position loop's stiffness) and an `authority` in m/s² per axis; `bandwidth` 0 switches it off.
+    The integral of the distance to the expected linear behaviour: `bandwidth` in rad/s is its gain over the
+    position loop's stiffness, a fifth of that loop's natural frequency, so that it takes little of its phase;
+    `authority` in m/s² per axis. `bandwidth` 0 switches it off.
     """
 
-    bandwidth: float = 0.25
-    authority: float = 1.0
+    bandwidth: float = field(default=0.4, metadata={"zero": "switches it off"})
+    authority: float = 2.0
 
 
 def make_controller(
@@ -198,11 +199,12 @@ class Corrected:
         self._behaviour: LinearBehaviour | None = None
         self._trim = ZERO  # m/s², world
         self._share = 0.0
+        self._at_limit = False
         self._command = ZERO
         self._rates, self._inverse = RateModel(corrector.actuation), LagInverse()
 
     def start(self) -> None:
-        """Expect the linear behaviour from the next tick's state on."""
+        """Expect the linear behaviour from the next tick's state on; what the trim has learned stays."""
         self._running, self._behaviour = True, None
 
     def stop(self) -> None:
@@ -277,6 +279,7 @@ class Corrected:
             Attitude(tilt_late.roll, tilt_late.pitch, lifted_thrust),
             (led[0] + ahead * correction.rate[0], led[1] + ahead * correction.rate[1], 0.0),
         )
+        self._at_limit = law.at_limit(attitude)
         wanted = law.euler_rates(tilted, attitude, reference.yaw)
         then = law.euler_rates(
             (tilted[0] + ahead * rates[0], tilted[1] + ahead * rates[1], yaw), later, reference.yaw
@@ -304,7 +307,10 @@ class Corrected:
                 )
             else:
                 self._behaviour.step(reference, dt)
-                self._grow(state.position, self._behaviour.position, zeta[2], share * min(_LONGEST_STEP, dt))
+                if not self._at_limit:  # what is missing there is not the correction
+                    self._grow(
+                        state.position, self._behaviour.position, zeta[2], share * min(_LONGEST_STEP, dt)
+                    )
         c, s = math.cos(zeta[2]), math.sin(zeta[2])
         x, y, z = (share * t for t in self._trim)
         return c * x + s * y, c * y - s * x, z

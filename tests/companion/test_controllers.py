@@ -215,7 +215,7 @@ def test_the_trim_turns_with_the_vehicle_for_what_stands_still_in_the_world() ->
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.integers(0, 10**6), st.floats(0.005, 0.08), st.floats(0.01, 0.1), st.floats(0.0, 8.0))
+@given(st.integers(0, 10**6), st.floats(0.005, 0.08), st.floats(0.02, 0.1), st.floats(0.0, 8.0))
 def test_the_rate_model_tells_what_the_commands_on_their_way_will_do(seed, delay, lag, integral) -> None:
     """Undelayed response minus delayed response, against the ground's own simulation of the same loop."""
     command = np.cumsum(np.random.default_rng(seed).normal(size=(200, 2)), axis=0) * 0.05
