@@ -9,7 +9,8 @@ it is known. Thrust acts after the motors' delay and lag, tilt in addition only 
 cascade is evaluated for the moment at which its command will act, the rate loop's lag is inverted, and the
 attitude asked for the correction c is led by the attitude loop itself: `zeta_ref = u* + c + c_dot / K_zeta` makes
 `zeta - c` follow `u*` as the linear design does. The model is asked at the attitude that the vehicle will have,
-which is what it was fitted to, not at the one asked for; that also leaves no equation to be solved for u.
+which is what it was fitted to, not at the one asked for; that also leaves no equation to be solved for u. Of the
+height it is told the expected one: see `Corrected._ahead`.
 """
 
 from __future__ import annotations
@@ -66,8 +67,11 @@ class Corrector(Protocol):
         """What is known of the path from command to motion."""
         ...
 
-    def step(self, rows: Sequence[list[float]], ahead: float, dt: float) -> Correction:
-        """The correction for three rows of features: when tilt acts, `ahead` s later, and when thrust acts."""
+    def step(self, rows: Sequence[list[float]], ahead: float, dt: float, height: float) -> Correction:
+        """The correction for three rows of features: when tilt acts, `ahead` s later, and when thrust acts.
+
+        `height` above the ground, m, is the measured one.
+        """
         ...
 
 
@@ -238,9 +242,9 @@ class Corrected:
         ahead = max(known.rate_lag, _AHEAD)
         lift = known.thrust_delay + known.thrust_lag
         acceleration = _acceleration(state)
-        early = _after(state, acceleration, known.rate_delay)
-        late = _after(state, acceleration, known.rate_delay + ahead)
-        lifted = _after(state, acceleration, lift)
+        early = self._ahead(state, acceleration, known.rate_delay)
+        late = self._ahead(state, acceleration, known.rate_delay + ahead)
+        lifted = self._ahead(state, acceleration, lift)
         reference = preview(known.rate_delay)
         tilt = law.feedback(early, yaw, reference)
         tilt_late = law.feedback(late, yaw, preview(known.rate_delay + ahead))
@@ -266,7 +270,7 @@ class Corrected:
                 corrector.wants_yaw,
             ),
         ]
-        correction = corrector.step(rows, ahead, dt)
+        correction = corrector.step(rows, ahead, dt, state.height)
         x, y, z = (a + t for a, t in zip(correction.applied, trim, strict=True))
         # The attitude loop takes 1 / K to follow: lead the correction by that much.
         led = (
@@ -289,6 +293,19 @@ class Corrected:
         command = law.turning(zeta, (wanted[0] + added[0], wanted[1] + added[1], wanted[2]), attitude.thrust)
         self._command = command.body_rate
         return ControlStep(plain, (x, y, z), correction.raw, command, law.normalised(command.thrust), trim)
+
+    def _ahead(self, state: State, acceleration: Vector, h: float) -> State:
+        """The state `h` s later; its height is that of the linear behaviour, where one is expected.
+
+        Ground effect holds a vehicle up; a correction of the measured height's ground effect takes that away, and a
+        little too much of it lets the vehicle sink. At the expected height the correction is the same along the
+        way, and what the ground does to a deviation is left to help.
+        """
+        later = _after(state, acceleration, h)
+        if self._behaviour is None:
+            return later
+        deviation = state.position[2] - self._behaviour.position[2]
+        return later._replace(height=state.height - deviation + h * self._behaviour.velocity[2])
 
     def _faded(self, engaged: float, dt: float) -> float:
         """The share of look-ahead and trim: follows what is engaged, at the pace of a fade at most."""

@@ -42,7 +42,8 @@ class GuardLimits:
     after `patience` s beyond. `deadline` s for the inferences of one tick: `misses` late ones in a row trip, as
     does a single one of more than `stall` s. One late inference alone says more of the operating system than of
     the model.
-    `fade` s from nothing to full effect and back, and from one model to another.
+    `fade` s from nothing to full effect and back, and from one model to another. Below `ground` m above the ground the
+    thrust that models may take away runs down to nothing.
     """
 
     authority: Vector = (3.0, 3.0, 4.0)
@@ -54,6 +55,7 @@ class GuardLimits:
     misses: int = 5
     stall: float = 0.05
     fade: float = 1.0
+    ground: float = 0.5
 
 
 class Look(NamedTuple):

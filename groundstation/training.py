@@ -66,6 +66,9 @@ class Recipe:
 PAPER = Recipe("paper", "nadam", 0.05, 256, 1000, "plateau")
 """Carvalho et al. 2022, section V. Patience of the plateau, and of the end, are not in the paper: 10 is Keras's."""
 OWN = Recipe("default", "adamw", 0.02, 1024, 60, "one_cycle", weight_decay=0.1, average=1.0, patience=30)
+RANGE_TAIL = 0.001
+"""Share of the samples at each end of a feature that does not count to the training range: a network has learnt
+nothing where it has seen a handful of samples."""
 RECIPES = {"default": OWN, "paper": PAPER}
 
 
@@ -173,7 +176,7 @@ class _Run:
         self.centre = x.mean(axis=0)
         self.scale = np.maximum(x.std(axis=0), [_FLOORS[units[n]] for n in samples.names]).astype(np.float32)
         self.out = np.maximum(y.std(axis=0), 1e-3).astype(np.float32)
-        self.low, self.high = x.min(axis=0), x.max(axis=0)
+        self.low, self.high = np.quantile(x, (RANGE_TAIL, 1.0 - RANGE_TAIL), axis=0).astype(np.float32)
         self.x, self.y = (self._normalised(samples.only(side)) for side in sides)
         # squared error in (m/s²)², whatever the scale of each output
         self.weight = torch.from_numpy(self.out**2)

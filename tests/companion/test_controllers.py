@@ -47,7 +47,7 @@ class Oracle:
         self.delta, self.actuation, self.engaged = delta, actuation, engaged
         self.applied = ZERO
 
-    def step(self, rows: Sequence[list[float]], ahead: float, dt: float) -> Correction:
+    def step(self, rows: Sequence[list[float]], ahead: float, dt: float, height: float) -> Correction:
         now, later, lifted = (self.delta(row) for row in rows)
         self.applied = (now[0], now[1], lifted[2])
         return Correction(
@@ -298,6 +298,15 @@ def test_the_integral_holds_a_constant_push_and_does_not_wind_up() -> None:
         controller.step(far, lambda ahead: still, DT)
     home = replace_position(far, (0.0, 0.0, 1.0))
     assert controller.step(home, lambda ahead: still, DT).command.body_rate[1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_ground_effect_that_is_expected_too_strong_does_not_pull_the_vehicle_down() -> None:
+    """Corrected at the measured height this falls: the correction loses more with height than the loop gives."""
+    cushion = lambda gain: lambda features: (0.0, 0.0, gain * 1.2 * math.exp(-features[0] / 0.06))  # noqa: E731
+    low = trajectory("lemniscate", height=0.15)
+    vehicle = Linear(delta=cushion(1.0))
+    error = flown(Corrected(LAW, Oracle(cushion(2.0)), TrimLimits()), vehicle, low)
+    assert np.abs(error[:, 2]).max() < 0.05
 
 
 def replace_position(state: State, position: tuple[float, float, float]) -> State:
