@@ -302,7 +302,7 @@ def test_the_integral_holds_a_constant_push_and_does_not_wind_up() -> None:
 
 def test_a_ground_effect_that_is_expected_too_strong_does_not_pull_the_vehicle_down() -> None:
     """Corrected at the measured height this falls: the correction loses more with height than the loop gives."""
-    cushion = lambda gain: lambda features: (0.0, 0.0, gain * 1.2 * math.exp(-features[0] / 0.06))  # noqa: E731
+    cushion = lambda gain: lambda features: (0.0, 0.0, gain * 8.0 * math.exp(-features[0] / 0.06))  # noqa: E731
     low = trajectory("lemniscate", height=0.15)
     vehicle = Linear(delta=cushion(1.0))
     error = flown(Corrected(LAW, Oracle(cushion(2.0)), TrimLimits()), vehicle, low)
