@@ -213,8 +213,10 @@ def test_samples_on_the_ground_are_not_learnt_from(flights, base) -> None:
 
 def test_training_range_is_that_of_the_flights_trained_on(trained, samples) -> None:
     learn = samples.only(trained.train).with_features(trained.network.features).features
-    np.testing.assert_array_equal(trained.network.low, learn.min(axis=0))
-    np.testing.assert_array_equal(trained.network.high, learn.max(axis=0))
+    # All but the last thousandth at each end: a handful of samples teaches nothing.
+    outside = np.mean((learn < trained.network.low) | (learn > trained.network.high), axis=0)
+    assert np.all(outside > 0.0)
+    assert np.all(outside <= 0.0025)
 
 
 def test_a_new_effect_drops_the_network_that_was_trained_without_it(trained, base, flights, tmp_path) -> None:
