@@ -60,7 +60,7 @@ class Guard:
         limits: GuardLimits | None = None,
         wants_yaw: bool = False,
         on_trip: Callable[[str, str], None] | None = None,
-        clock: Callable[[], float] = time.perf_counter,
+        clock: Callable[[], float] = time.thread_time,
         name: str = "",
         actuation: Actuation = ACTS_AT_ONCE,
     ) -> None:

@@ -40,9 +40,8 @@ class GuardLimits:
     `authority` m/s² and `slew` m/s³ per axis of the heading frame. A raw value beyond `absurd` times the
     authority trips; one beyond the authority is cut and trips after `patience` s without a pause. Outside the
     training range the correction is scaled down, to nothing at `margin` times the range's width, and trips
-    after `patience` s beyond. `deadline` s for the inferences of one tick: `misses` late ones in a row trip, as
-    does a single one of more than `stall` s. One late inference alone says more of the operating system than of
-    the model.
+    after `patience` s beyond. `deadline` s of processor time for the inferences of one tick: `misses` late ones in a row
+    trip, as does a single one of more than `stall` s.
     `fade` s from nothing to full effect and back, and from one model to another. Below `ground` m above the ground the
     thrust that models may take away runs down to nothing.
     """
@@ -80,8 +79,9 @@ class Watch:
     """One model during one flight.
 
     `model` maps features to three error accelerations (m/s², heading frame). `ranges` are the features'
-    training ranges in the model's order. `name` is the model's hash, `actuation` what it knows
-    of the path from command to motion. `clock` is for tests.
+    training ranges in the model's order. `name` is the model's hash, `actuation` what it knows of the path from
+    command to motion. `clock` tells what an inference took: this thread's own processor time, for what others take
+    from it says nothing of the model.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Watch:
         limits: GuardLimits | None = None,
         wants_yaw: bool = False,
         name: str = "",
-        clock: Callable[[], float] = time.perf_counter,
+        clock: Callable[[], float] = time.thread_time,
         actuation: Actuation = ACTS_AT_ONCE,
     ) -> None:
         self.name, self.wants_yaw, self.actuation = name, wants_yaw, actuation

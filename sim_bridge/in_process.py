@@ -195,7 +195,6 @@ def _guard(plan: Plan) -> Guard | None:
         verdict.model,
         info.features,
         wants_yaw=info.wants_yaw,
-        clock=time.thread_time,  # what others take from the processor must not decide what a simulated flight becomes
         actuation=info.actuation,
     )
 
