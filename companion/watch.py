@@ -40,8 +40,8 @@ class GuardLimits:
     `authority` m/s² and `slew` m/s³ per axis of the heading frame. A raw value beyond `absurd` times the
     authority trips; one beyond the authority is cut and trips after `patience` s without a pause. Outside the
     training range the correction is scaled down, to nothing at `margin` times the range's width, and trips
-    after `patience` s beyond. `deadline` s of processor time for the inferences of one tick: `misses` late ones in a row
-    trip, as does a single one of more than `stall` s.
+    after `patience` s beyond. `deadline` s of processor time for the inferences of one tick: `misses` late
+    ones in a row trip, as does a single one of more than `stall` s.
     `fade` s from nothing to full effect and back, and from one model to another. Below `ground` m above the ground the
     thrust that models may take away runs down to nothing.
     """

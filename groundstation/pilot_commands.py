@@ -91,7 +91,8 @@ def fly_command(
     trajectory: Annotated[
         str, typer.Argument(help="Name of a trajectory (`groundstation fly list`), or a CSV of setpoints.")
     ],
-    controller: Annotated[str, typer.Option(help="lqr, lqr_integral, or corrected by the deployed model.")
+    controller: Annotated[
+        str, typer.Option(help="lqr, lqr_integral, or corrected by the deployed model.")
     ] = "lqr",
     parameters: Annotated[
         list[str] | None, typer.Option("--set", help="Parameter of the trajectory, NAME=VALUE.")

@@ -172,7 +172,7 @@ def _print(study: Study, scenarios: Sequence[Scenario], companion: bool) -> None
     table.add_column("flight", no_wrap=True)
     for name in (*names[:-1], "both"):
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("÷ lqr / int.", justify="right", no_wrap=True)
+    table.add_column("÷ lqr, int.", justify="right", no_wrap=True)
     rows = [(s.name, s.name, "in-process") for s in scenarios]
     if companion:
         real = [s.name for s in scenarios if s.name in ("unseen", "low")]
@@ -184,7 +184,7 @@ def _print(study: Study, scenarios: Sequence[Scenario], companion: bool) -> None
             table.add_row(
                 f"{label} {letter}",
                 *(_cell(column) for column in columns),
-                f"{_ratio(columns[0], columns[-1])} / {_ratio(columns[1], columns[-1])}",
+                f"{_ratio(columns[0], columns[-1])}, {_ratio(columns[1], columns[-1])}",
             )
         table.add_section()
     for where, figures in PAPER.items():
@@ -196,13 +196,13 @@ def _print(study: Study, scenarios: Sequence[Scenario], companion: bool) -> None
                 "",
                 _short(network[axis]),
                 "",
-                f"{lqr[axis] / network[axis]:.0f} / {integral[axis] / network[axis]:.0f}",
+                f"{lqr[axis] / network[axis]:.0f}, {integral[axis] / network[axis]:.0f}",
                 style="dim",
             )
         table.add_section()
     console.print(table)
-    for scenario in scenarios:
-        console.print(f"{scenario.name}: {scenario.title}", style="dim", highlight=False)
+    for one in scenarios:
+        console.print(f"{one.name}: {one.title}", style="dim", highlight=False)
     if companion:
         console.print("*: by the companion over MAVLink, in real time; the others in-process", style="dim")
     parts = Table(
