@@ -147,7 +147,7 @@ def test_bad_models_are_refused_in_flight_and_the_vehicle_does_not_notice(compan
     good = drag_model(0.05)
     assert deploy(companion, good)["state"] == "live"
     mission = companion.fly(
-        trajectory="lemniscate", parameters={"laps": 8.0, "speed": 2.0}, controller="corrected"
+        trajectory="lemniscate", parameters={"laps": 100.0, "speed": 2.0}, controller="corrected"
     )
     companion.phase("mission")
     wait_for(lambda: companion.ticks[-1].guard == "active", "the correction")
