@@ -35,6 +35,12 @@ _SETTLED_DISTANCE, _SETTLED_SPEED = 0.15, 0.25
 _LAND_FROM = 0.4  # m above ground at which the autopilot's own Land mode takes the last bit
 
 
+_TUMBLED = 1.4
+"""rad of tilt, twice what the cascade may ask for: a vehicle there for longer than `_TUMBLING` s has crashed, or
+nothing that a linear design sends can bring it back."""
+_TUMBLING = 0.5
+
+
 @dataclass(frozen=True)
 class Safety:
     """Where a flight may go and when it must end.
@@ -171,6 +177,7 @@ class Flight:
     _now: float = 0.0
     _previous: Odometry | None = None
     _low_since: float = math.inf
+    _tumbled_since: float = math.inf
     _yaw: float = 0.0
     _sending: bool = False
     _unwatched: tuple[Odometry, Odometry | None, Outcome] | None = None
@@ -191,7 +198,7 @@ class Flight:
                 self._controller = make_controller(mission.controller, self.law, mission.guard, self.trim)
                 self._legs.clear()
                 self._leg, self.wants_land = None, False
-                self._low_since = math.inf
+                self._low_since = self._tumbled_since = math.inf
 
         self._orders.append(order)
 
@@ -439,7 +446,15 @@ class Flight:
         self, odometry: Odometry, previous: Odometry | None, interval: float, position: Vector, latest: Latest
     ) -> None:
         safety = self.safety
-        if self.wants_land or latest.flight_mode != "OFFBOARD":
+        if latest.flight_mode != "OFFBOARD":
+            return
+        _, x, y, _ = odometry.quaternion
+        tumbled = 1.0 - 2.0 * (x * x + y * y) < math.cos(_TUMBLED)  # body z against the vertical
+        self._tumbled_since = min(self._tumbled_since, self._now) if tumbled else math.inf
+        if self._now - self._tumbled_since > _TUMBLING:
+            self._silence("tumbled", f"tilted by more than {math.degrees(_TUMBLED):.0f} degrees: silent")
+            return
+        if self.wants_land:
             return
         if interval > safety.odometry_gap or interval < 0.0:
             what = f"missing for {interval:.2f} s" if interval > 0.0 else "going back in time"

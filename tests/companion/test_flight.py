@@ -295,6 +295,19 @@ def test_the_correction_is_on_when_the_mission_begins_and_off_after_it() -> None
     assert landing[-1].step.correction == (0.0, 0.0, 0.0)
 
 
+def test_a_vehicle_on_its_back_gets_no_more_setpoints() -> None:
+    rig = Rig()
+    rig.take_off(Mission("m1", trajectory("hover", duration=20.0)))
+    rig.until(MISSION)
+    rig.run(1.0)
+    for _ in range(60):
+        rig.tilt = [3.0, 0.0]
+        out = rig.tick()
+    assert out.phase == SILENT
+    assert out.step is None
+    assert "tumbled" in [kind for kind, _ in rig.events]
+
+
 def test_the_fence_is_checked_before_flying() -> None:
     safety = Safety(fence_radius=3.0, fence_height=2.0)
     assert safety.check_trajectory(trajectory("circle", radius=2.0)) == ""
