@@ -380,17 +380,18 @@ class Director:
         reason = self._check() or self._start(progress)
         if reason:
             self.flight.cancel(reason)
-            progress.state, progress.reason = "failed", reason
             self.emit("error", "mission_failed", f"{mission.trajectory.name} not flown: {reason}")
             self._stop_recording()
+            progress.state, progress.reason = "failed", reason
             return
         self._accompany()
         self._settle()
         outcome = self.flight.outcome
-        progress.state = "finished" if outcome == "finished" else "aborted"
-        progress.reason = outcome
         self.emit("info", "mission_ended", f"{mission.trajectory.name}: {outcome}")
         self._stop_recording()
+        # Told last: whoever hears that it is over may fetch the record, which must be whole by then.
+        progress.reason = outcome
+        progress.state = "finished" if outcome == "finished" else "aborted"
 
     def _renewed(self, progress: Progress) -> str:
         """What is live now flies, not what was when the mission was asked for; '' or the reason why not."""

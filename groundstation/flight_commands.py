@@ -355,6 +355,8 @@ def track_command(
         return
     from rich.table import Table
 
+    for t in tracked:
+        _print_notes(t.flight)
     table = Table(title="mean squared error against the expected linear behaviour")
     table.add_column("axis", no_wrap=True)
     for t in tracked:

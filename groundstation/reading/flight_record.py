@@ -76,7 +76,17 @@ def read_flight_record(path: Path, vehicle: str | Path | Vehicle | None = None) 
         lambda row: f"{path}, tick {row + 1}",
         extra=extra,
         commanded=commanded,
-        notes=record.notes,
+        notes=(*record.notes, *_trip(ticks["guard"], t)),
+    )
+
+
+def _trip(guard: np.ndarray, t: np.ndarray) -> list[str]:
+    """That the correction was switched off in flight, when and why: whoever reads a figure must know."""
+    tripped = np.flatnonzero([word.startswith("tripped") for word in guard])
+    return (
+        [f"correction switched off at {t[tripped[0]]:.1f} s: guard {guard[tripped[0]]}"]
+        if len(tripped)
+        else []
     )
 
 
