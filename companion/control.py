@@ -98,6 +98,15 @@ def euler(quaternion: tuple[float, float, float, float]) -> Vector:
     )
 
 
+def world_from_body(quaternion: tuple[float, float, float, float], vector: Vector) -> Vector:
+    """A vector in body axes turned into the world by the unit quaternion w, x, y, z; as `models.frames.rotate`."""
+    w, x, y, z = quaternion
+    vx, vy, vz = vector
+    # R v = v + 2 q x (q x v + w v)
+    a, b, c = y * vz - z * vy + w * vx, z * vx - x * vz + w * vy, x * vy - y * vx + w * vz
+    return vx + 2.0 * (y * c - z * b), vy + 2.0 * (z * a - x * c), vz + 2.0 * (x * b - y * a)
+
+
 def features(
     state: State, yaw: float, attitude: Attitude, voltage: float, wants_yaw: bool = False
 ) -> list[float]:

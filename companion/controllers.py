@@ -31,6 +31,7 @@ from companion.control import (
     Vector,
     euler,
     features,
+    world_from_body,
 )
 from companion.guard import Correction
 from models.contract import CONTROLLERS, CORRECTED, LQR, LQR_INTEGRAL
@@ -253,23 +254,13 @@ class Corrected:
         before = corrector.applied
         asked = law.corrected(Attitude(0.0, 0.0, thrust), (0.0, 0.0, before[2] + trim[2])).thrust
         voltage = state.battery_voltage if state.battery_voltage > 0.0 else law.vehicle.nominal_voltage
-        rows = [
-            features(early, yaw, Attitude(tilted[0], tilted[1], asked), voltage, corrector.wants_yaw),
-            features(
-                late,
-                yaw,
-                Attitude(tilted[0] + ahead * rates[0], tilted[1] + ahead * rates[1], asked),
-                voltage,
-                corrector.wants_yaw,
-            ),
-            features(
-                lifted,
-                yaw,
-                Attitude(zeta[0] + lift * rates[0], zeta[1] + lift * rates[1], asked),
-                voltage,
-                corrector.wants_yaw,
-            ),
-        ]
+        roll, pitch = tilted[0] + ahead * rates[0], tilted[1] + ahead * rates[1]
+        moments = (
+            (early, Attitude(tilted[0], tilted[1], asked)),
+            (late, Attitude(roll, pitch, asked)),
+            (lifted, Attitude(zeta[0] + lift * rates[0], zeta[1] + lift * rates[1], asked)),
+        )
+        rows = [features(then, yaw, attitude, voltage, corrector.wants_yaw) for then, attitude in moments]
         correction = corrector.step(rows, ahead, dt, state.height)
         x, y, z = (a + t for a, t in zip(correction.applied, trim, strict=True))
         # The attitude loop takes 1 / K to follow: lead the correction by that much.
@@ -285,10 +276,8 @@ class Corrected:
         )
         self._at_limit = law.at_limit(attitude)
         wanted = law.euler_rates(tilted, attitude, reference.yaw)
-        then = law.euler_rates(
-            (tilted[0] + ahead * rates[0], tilted[1] + ahead * rates[1], yaw), later, reference.yaw
-        )
-        slope = ((then[0] - wanted[0]) / ahead, (then[1] - wanted[1]) / ahead)
+        soon = law.euler_rates((roll, pitch, yaw), later, reference.yaw)
+        slope = ((soon[0] - wanted[0]) / ahead, (soon[1] - wanted[1]) / ahead)
         added = self._inverse.step(slope, known.rate_lag, known.rate_integral, dt)
         command = law.turning(zeta, (wanted[0] + added[0], wanted[1] + added[1], wanted[2]), attitude.thrust)
         self._command = command.body_rate
@@ -317,17 +306,14 @@ class Corrected:
         self, state: State, zeta: Vector, reference: ReferenceSample, share: float, dt: float
     ) -> Vector:
         """The trim (m/s², heading frame) after this tick's distance to the linear behaviour."""
-        if self._running and self._limits.bandwidth > 0.0:
-            if self._behaviour is None:
-                self._behaviour = LinearBehaviour(
-                    self._law.design, state.position, state.velocity, zeta, reference
-                )
-            else:
-                self._behaviour.step(reference, dt)
-                if not self._at_limit:  # what is missing there is not the correction
-                    self._grow(
-                        state.position, self._behaviour.position, zeta[2], share * min(_LONGEST_STEP, dt)
-                    )
+        if self._running and self._behaviour is None:
+            self._behaviour = LinearBehaviour(
+                self._law.design, state.position, state.velocity, zeta, reference
+            )
+        elif self._behaviour is not None:
+            self._behaviour.step(reference, dt)
+            if not self._at_limit:  # what is missing there is not the correction
+                self._grow(state.position, self._behaviour.position, zeta[2], share * min(_LONGEST_STEP, dt))
         c, s = math.cos(zeta[2]), math.sin(zeta[2])
         x, y, z = (share * t for t in self._trim)
         return c * x + s * y, c * y - s * x, z
@@ -352,15 +338,8 @@ def _acceleration(state: State) -> Vector:
     """Acceleration in the world, m/s², as the accelerometer has it; none where there is no accelerometer."""
     if state.specific_force is None:
         return ZERO
-    w, x, y, z = state.quaternion
-    fx, fy, fz = state.specific_force
-    # R f = f + 2 q x (q x f + w f)
-    a, b, c = y * fz - z * fy + w * fx, z * fx - x * fz + w * fy, x * fy - y * fx + w * fz
-    return (
-        fx + 2.0 * (y * c - z * b),
-        fy + 2.0 * (z * a - x * c),
-        fz + 2.0 * (x * b - y * a) - GRAVITY,
-    )
+    x, y, z = world_from_body(state.quaternion, state.specific_force)
+    return x, y, z - GRAVITY
 
 
 def _after(state: State, acceleration: Vector, h: float) -> State:

@@ -19,11 +19,11 @@ from typing import Any
 
 from companion.flight import IDLE, LANDING, SILENT, TAKEOFF, Decision, Flight, Mission, Safety
 from companion.guard import Guard
-from companion.inference import Model
 from companion.shadow import Shadow, ShadowLimits
 from companion.store import ModelStore
 from companion.vehicle_link import Rates, VehicleLink
-from companion.watch import GuardLimits, Watch
+from companion.watch import GuardLimits
+from models.contract import CORRECTED
 from models.design import Design
 from models.errors import InputError
 from models.record import FlightRecorder
@@ -143,14 +143,12 @@ class Director:
         with self._deploying:
             earlier = self.store.previous_name
             try:
-                watch = (
-                    self._watch(self.store.open(earlier)) if earlier and self.flight.phase != IDLE else None
-                )
+                earlier_model = self.store.open(earlier) if earlier and self.flight.phase != IDLE else None
             except InputError as error:
                 return {"accepted": False, "reason": str(error)}
             answer = self.store.roll_back()
             if answer["accepted"]:
-                self.flight.roll_back(watch)
+                self.flight.roll_back(earlier_model.watched(self.guard_limits) if earlier_model else None)
                 self.flight.live = self.store.live_name
                 self.emit("info", "model_rolled_back", f"by command: {answer['reason']}")
             return answer
@@ -281,7 +279,7 @@ class Director:
         }
 
     def _prepared(self, identity: str, path: Trajectory, controller: str, repeat: int) -> Mission:
-        guard = self._guard() if controller == "corrected" else None
+        guard = self._guard() if controller == CORRECTED else None
         return Mission(identity, path, controller, repeat, guard)
 
     def _guard(self) -> Guard | None:
@@ -293,27 +291,12 @@ class Director:
         def tripped(name: str, reason: str) -> None:
             self.emit("warning", "guard_trip", f"correction {name} switched off: {reason}")
 
-        info = model.info
-        return Guard(
-            model,
-            info.features,
-            self.guard_limits,
-            info.wants_yaw,
-            tripped,
-            name=info.hash,
-            actuation=info.actuation,
-        )
-
-    def _watch(self, model: Model) -> Watch:
-        info = model.info
-        return Watch(
-            model, info.features, self.guard_limits, info.wants_yaw, info.hash, actuation=info.actuation
-        )
+        return Guard(model.watched(self.guard_limits), tripped)
 
     def _try(self, name: str, seconds: float | None = None) -> str:
         """Put the staged model into the shadow of the flight; '' or why not."""
         try:
-            watch = self._watch(self.store.open(name))
+            watch = self.store.open(name).watched(self.guard_limits)
         except InputError as error:
             self.store.discard(name)
             return str(error)

@@ -33,8 +33,6 @@ Vector = tuple[float, float, float]
 IDLE, TAKEOFF, MISSION, LANDING, SILENT = "idle", "takeoff", "mission", "landing", "silent"
 _SETTLED_DISTANCE, _SETTLED_SPEED = 0.15, 0.25
 _LAND_FROM = 0.4  # m above ground at which the autopilot's own Land mode takes the last bit
-
-
 _TUMBLED = 1.4
 """rad of tilt, twice what the cascade may ask for: a vehicle there for longer than `_TUMBLING` s has crashed, or
 nothing that a linear design sends can bring it back."""
@@ -340,6 +338,7 @@ class Flight:
             return out  # landing by the autopilot's own mode
         out.reference = self._reference(position, odometry)
         out.phase = self.phase
+        guard = mission.guard
         state = State(
             position,
             odometry.velocity,
@@ -347,9 +346,8 @@ class Flight:
             position[2],
             latest.battery_voltage,
             odometry.angular_velocity,
-            _finite(latest.specific_force),
+            _finite(latest.specific_force) if guard is not None else None,
         )
-        guard = mission.guard
         assert self._controller is not None
         out.step = self._controller.step(state, self._preview, interval)
         if guard is not None:
@@ -558,9 +556,8 @@ class Flight:
             self.decisions.append(Decision("undecided", shadow.name))
 
 
-def _finite(force: tuple[float | None, ...] | None) -> Vector | None:
+def _finite(force: Vector | None) -> Vector | None:
     """The specific force, where the accelerometer has told a whole one."""
-    if force is None or None in force:
+    if force is None or any(component is None for component in force) or not math.isfinite(sum(force)):
         return None
-    x, y, z = force
-    return (x, y, z) if math.isfinite(x + y + z) else None  # type: ignore[operator,return-value]
+    return force

@@ -12,15 +12,12 @@ Whatever the models do, the applied correction stays finite, within the authorit
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import astuple
 from typing import NamedTuple
 
 from companion.actuation import ACTS_AT_ONCE, Actuation
-from companion.watch import ZERO, GuardLimits, Range, Vector, Watch
-
-__all__ = ["Guard", "GuardLimits", "Range", "Watch"]
+from companion.watch import ZERO, Vector, Watch
 
 OFF, FADING_IN, ACTIVE, FADING_OVER, FADING_OUT, TRIPPED = (
     "off",
@@ -49,28 +46,18 @@ class Correction(NamedTuple):
 class Guard:
     """Stands between models and command during one flight; begins with one model, live and not yet faded in.
 
-    `model`, `ranges`, `wants_yaw`, `name` and `clock` as for `Watch`. `on_trip` is told the name of a model and
-    the reason once, from the thread that calls `step`, and must not block. All methods belong to that thread.
+    `watch` is the first model's; its limits are the guard's. `on_trip` is told the name of a model and the reason
+    once, from the thread that calls `step`, and must not block. All methods belong to that thread.
     """
 
-    def __init__(
-        self,
-        model: Callable[[Sequence[float]], Sequence[float]],
-        ranges: Sequence[Range],
-        limits: GuardLimits | None = None,
-        wants_yaw: bool = False,
-        on_trip: Callable[[str, str], None] | None = None,
-        clock: Callable[[], float] = time.thread_time,
-        name: str = "",
-        actuation: Actuation = ACTS_AT_ONCE,
-    ) -> None:
-        self.limits = limits if limits is not None else GuardLimits()
-        self.wants_yaw = wants_yaw
+    def __init__(self, watch: Watch, on_trip: Callable[[str, str], None] | None = None) -> None:
+        self.limits = watch.limits
+        self.wants_yaw = watch.wants_yaw
         self.inference_time = 0.0
         self._on_trip = on_trip
-        self._live: Watch | None = Watch(model, ranges, self.limits, wants_yaw, name, clock, actuation)
+        self._live: Watch | None = watch
         self._last_good: Watch | None = None
-        self._weights: dict[Watch, float] = {self._live: 0.0}
+        self._weights: dict[Watch, float] = {watch: 0.0}
         self._tripped: dict[str, Watch] = {}
         self._running = False
         self._applied = ZERO
@@ -140,12 +127,6 @@ class Guard:
             self._live = None
         else:
             self._enter(target)
-
-    def trip(self, reason: str) -> None:
-        """Give up on the live model for a reason that only others can see."""
-        if self._live is not None and not self._live.tripped:
-            self._live.trip(reason)
-            self._drop(self._live)
 
     @property
     def engaged(self) -> float:

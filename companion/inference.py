@@ -14,7 +14,7 @@ import numpy as np
 import onnxruntime
 
 from companion.actuation import ACTS_AT_ONCE, Actuation
-from companion.watch import Range
+from companion.watch import GuardLimits, Range, Watch
 from models import contract
 from models.errors import InputError
 from models.vehicle import Vehicle
@@ -73,6 +73,11 @@ class Model:
         given[:] = rows
         self._session.run_with_iobinding(binding)
         return answer.tolist()
+
+    def watched(self, limits: GuardLimits | None = None) -> Watch:
+        """A watch over this model, for one flight."""
+        info = self.info
+        return Watch(self, info.features, limits, info.wants_yaw, info.hash, actuation=info.actuation)
 
     def _bind(self, rows: int) -> tuple[np.ndarray, np.ndarray, onnxruntime.IOBinding]:
         given = np.zeros((rows, len(self.info.features)), dtype=np.float32)

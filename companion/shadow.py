@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from companion.control import euler
+from companion.control import euler, world_from_body
 from companion.watch import ZERO, Vector, Watch
 from models.vehicle import GRAVITY
 
@@ -41,11 +41,7 @@ def error_acceleration(
 
     `quaternion` w, x, y, z body to world, `specific_force` m/s² body FLU, `thrust` N as commanded, `mass` kg.
     """
-    w, x, y, z = quaternion
-    fx, fy, fz = specific_force
-    # R f = f + 2 q x (q x f + w f)
-    a, b, c = y * fz - z * fy + w * fx, z * fx - x * fz + w * fy, x * fy - y * fx + w * fz
-    ax, ay, az = fx + 2.0 * (y * c - z * b), fy + 2.0 * (z * a - x * c), fz + 2.0 * (x * b - y * a)
+    ax, ay, az = world_from_body(quaternion, specific_force)
     roll, pitch, yaw = euler(quaternion)
     cosine, sine = math.cos(yaw), math.sin(yaw)
     return (

@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.markup import escape
 
 from groundstation.pilot_commands import (
-    ENDED,
     CfgOption,
     ConfigOption,
     ConnectOption,
@@ -23,7 +22,8 @@ from groundstation.pilot_commands import (
     NameOption,
     TimeoutOption,
     ZenohOption,
-    _settings,
+    check_controller,
+    link_settings,
 )
 from models.errors import InputError
 
@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from models.database import Collection, Sortie
 
 console = Console()
-
-_POLL = 0.3  # s between two looks at the companion's status
-_SILENCE = 30.0  # s that a link may be down in flight; the flight goes on without it
 
 
 def register(app: typer.Typer) -> None:
@@ -50,7 +47,9 @@ def collect_command(
     ],
     seed: Annotated[int, typer.Option(help="Of the flights' order, sizes, speeds and headings.", min=0)] = 0,
     minutes: Annotated[float, typer.Option(help="Flight time to collect, at least.")] = 30.0,
-    controller: Annotated[str, typer.Option(help="lqr, or corrected by the deployed model.")] = "lqr",
+    controller: Annotated[
+        str, typer.Option(help="lqr, lqr_integral, or corrected by the deployed model.")
+    ] = "lqr",
     patience: Annotated[
         float, typer.Option(help="s to wait on the ground for a companion that refuses.", min=0.0)
     ] = 60.0,
@@ -70,13 +69,14 @@ def collect_command(
     Each flight takes off and lands. Ends early when one is not flown to its end (a pilot took over, the battery is
     low); the same command continues with the flights that are missing, on another battery for instance.
     """
+    check_controller(controller)
     from groundstation.link import Link
     from models.database import Collection, database, record_name
 
     sorties = {
         record_name(number, sortie): sortie for number, sortie in enumerate(database(seed, minutes), 1)
     }
-    settings = _settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
+    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
     with Link(settings) as link:
         asked = {"vehicle": link.vehicle, "seed": seed, "minutes": minutes, "controller": controller}
         collection = Collection(output, {"flown_by": "groundstation collect", **asked})
@@ -143,7 +143,11 @@ def _fly(
     answer, reason = _requested(link, request, patience, tell)
     if reason:
         return {}, reason
-    ended = _ended(link, answer["mission"], tell)
+
+    def tell_status(status: dict[str, Any], entry: dict[str, Any]) -> None:
+        tell(f"{status['phase']}, {status['battery_voltage']:.1f} V")
+
+    ended = link.end_of(answer["mission"], tell_status, idle=True)
     if ended["state"] != "finished":
         return {}, f"{sortie.trajectory} was {ended['state']}: {ended['reason']}"
     if not ended["record"]:
@@ -178,31 +182,6 @@ def _requested(
             return {}, f"the companion refused {request['trajectory']}: {reason}"
         tell(f"waiting: {reason}")
         time.sleep(1.0)
-
-
-def _ended(link: Link, mission: str, tell: Callable[[str], None]) -> dict[str, Any]:
-    """The companion's entry of a mission, once that is over. Raises `InputError` where the companion is gone."""
-    silent_since: float | None = None
-    while True:
-        time.sleep(_POLL)
-        try:
-            status = link.status()
-            silent_since = None
-        except InputError:
-            silent_since = silent_since or time.monotonic()
-            if time.monotonic() - silent_since > _SILENCE:
-                raise
-            continue
-        entry = next((m for m in status["missions"] if m["mission"] == mission), None)
-        if entry is None:
-            raise InputError(
-                f"companion '{link.vehicle}' knows nothing of mission {mission} any more; did it restart? The same "
-                "command continues"
-            )
-        # A mission that has ended is followed by the next only when the vehicle is idle again.
-        if entry["state"] in ENDED and status["phase"] == "idle":
-            return dict(entry)
-        tell(f"{status['phase']}, {status['battery_voltage']:.1f} V")
 
 
 def _print_collected(flown: dict[str, dict[str, Any]]) -> None:

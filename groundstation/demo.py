@@ -132,11 +132,7 @@ def _fly(
     mission = {"trajectory": name, "parameters": parameters, "controller": controller, "repeat": 1}
     answer = link.request("mission", mission)
     with console.status(f"flying {name}: {answer['duration']:.0f} s and takeoff and landing"):
-        while True:
-            entry = next(m for m in link.status()["missions"] if m["mission"] == answer["mission"])
-            if entry["state"] in ("finished", "failed", "aborted"):
-                break
-            time.sleep(0.2)
+        entry = link.end_of(answer["mission"])
     if entry["state"] != "finished":
         raise InputError(
             f"mission {name} {entry['state']}: {entry['reason']}; see {folder / 'companion.log'}"
@@ -263,6 +259,9 @@ def _summary(console: Console, o: Outcome) -> None:
         f"found: [bold]{', '.join(found) or 'nothing missing'}[/bold]; hidden was: {o.revealed}",
         highlight=False,
     )
+    for note in corrected.flight.notes:
+        if note.startswith("correction"):
+            console.print(f"the corrected flight: {note}", style="yellow", highlight=False)
     console.print(
         f"Rerun recordings: {' '.join(str(p) for p in o.recordings)}", highlight=False, soft_wrap=True
     )

@@ -23,6 +23,10 @@ from models.errors import InputError
 from models.record_pb2 import Event, Tick
 
 PIECE_TRIES = 3
+ENDED = ("finished", "failed", "aborted")
+"""States of a mission that is over."""
+POLL, SILENCE = 0.3, 30.0
+"""s between two looks at a mission, and that a link may be down meanwhile."""
 CHECK_PATIENCE = 40.0
 """Seconds for the answer to a model: its check may take longer than any other request."""
 
@@ -96,6 +100,38 @@ class Link:
     def status(self) -> dict[str, Any]:
         """What the companion is doing."""
         return self.ask("status")
+
+    def end_of(
+        self,
+        mission: str,
+        tell: Callable[[dict[str, Any], dict[str, Any]], None] = lambda status, entry: None,
+        idle: bool = False,
+    ) -> dict[str, Any]:
+        """The companion's entry of a mission once it has ended (and, with `idle`, once the next one can follow).
+
+        `tell` gets status and entry at every look before that. The link may drop for a while in flight: the flight
+        goes on without it. Raises `InputError` where it stays down, or the companion forgot the mission.
+        """
+        silent_since: float | None = None
+        while True:
+            try:
+                status = self.status()
+                silent_since = None
+            except InputError:
+                silent_since = silent_since or time.monotonic()
+                if time.monotonic() - silent_since > SILENCE:
+                    raise
+                continue
+            entry = next((m for m in status["missions"] if m["mission"] == mission), None)
+            if entry is None:
+                raise InputError(
+                    f"companion '{self.vehicle}' knows nothing of mission {mission} any more; did it restart? Its "
+                    "records are still on board"
+                )
+            if entry["state"] in ENDED and not (idle and status["phase"] != "idle"):
+                return dict(entry)
+            tell(status, entry)
+            time.sleep(POLL)
 
     def deploy(self, onnx: bytes, shadow: float | None = None) -> dict[str, Any]:
         """Send a model; the answer's `state` is `live`, or `shadow` in flight, there for `shadow` s.

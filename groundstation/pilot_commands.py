@@ -43,7 +43,6 @@ TimeoutOption = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
-ENDED = ("finished", "failed", "aborted")
 STYLES = {"warning": "yellow", "error": "red"}
 
 
@@ -63,7 +62,7 @@ def register(app: typer.Typer) -> None:
     app.command("monitor", epilog="Example: groundstation monitor --save flight.rrd")(monitor_command)
 
 
-def _settings(
+def link_settings(
     config: Path | None,
     name: str | None,
     connect: list[str] | None,
@@ -73,6 +72,7 @@ def _settings(
     cfg: list[str] | None,
     timeout: float | None,
 ) -> Settings:
+    """The settings of a link: those of the file, overridden by the options given."""
     from groundstation.settings import load_settings
 
     given: dict[str, Any] = {
@@ -85,6 +85,12 @@ def _settings(
         "timeout": timeout,
     }
     return replace(load_settings(config), **{key: value for key, value in given.items() if value is not None})
+
+
+def check_controller(controller: str) -> None:
+    """Raise `InputError` for a controller that no companion knows."""
+    if controller not in CONTROLLERS:
+        raise InputError(f"--controller is '{controller}'; choose one of {', '.join(CONTROLLERS)}")
 
 
 def fly_command(
@@ -116,10 +122,9 @@ def fly_command(
     if trajectory == "list":
         _list_trajectories(as_json)
         return
-    if controller not in CONTROLLERS:
-        raise InputError(f"--controller is '{controller}'; choose one of {', '.join(CONTROLLERS)}")
+    check_controller(controller)
     mission = {**_mission(trajectory, parameters or []), "controller": controller, "repeat": repeat}
-    settings = _settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
+    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
     from groundstation.link import Link
 
     with Link(settings) as link:
@@ -226,36 +231,20 @@ def _accompany(
         *columns, console=console, transient=True, disable=quiet or not console.is_terminal
     ) as progress:
         task = progress.add_task(f"{answer['mission']}: waiting", total=None)
-        silent_since: float | None = None
-        while True:
+
+        def tell(status: dict[str, Any], entry: dict[str, Any]) -> None:
             _print_events(events, progress.console, quiet)
-            try:
-                status = link.status()
-                silent_since = None
-            except InputError:
-                # A link may drop for a while in flight; the flight goes on without it.
-                silent_since = silent_since or time.monotonic()
-                if time.monotonic() - silent_since > 30.0:
-                    raise
-                continue
-            entry = next((m for m in status["missions"] if m["mission"] == answer["mission"]), None)
-            if entry is None:
-                raise InputError(
-                    f"companion '{link.vehicle}' knows nothing of mission {answer['mission']} any more; did "
-                    "it restart? "
-                    "Its records are still on board"
-                )
-            if entry["state"] in ENDED:
-                time.sleep(0.2)  # the event that says why is on its way
-                _print_events(events, progress.console, quiet)
-                return dict(entry)
             phase = status["phase"] if entry["state"] == "flying" else entry["state"]
             progress.update(
                 task,
                 description=f"{answer['mission']} {entry['trajectory']} {entry['controller']}: {phase}, "
                 f"{status['battery_voltage']:.1f} V, guard {status['guard']}",
             )
-            time.sleep(0.3)
+
+        ended = link.end_of(answer["mission"], tell)
+        time.sleep(0.2)  # the event that says why is on its way
+        _print_events(events, progress.console, quiet)
+        return ended
 
 
 def _print_events(events: queue.SimpleQueue[Event], to: Console, quiet: bool) -> None:
@@ -317,7 +306,7 @@ def deploy_command(
     if roll_back and (model is not None or shadow is not None):
         raise InputError("--roll-back goes back to the previous model; leave the file and --shadow out")
     onnx = b"" if roll_back else _read_onnx(model)
-    settings = _settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
+    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
     with Link(settings) as link:
         vehicle = link.vehicle
         events: queue.SimpleQueue[Event] = queue.SimpleQueue()
@@ -432,7 +421,7 @@ def status_command(
     """What the companion is doing, and whether it could fly now."""
     from groundstation.link import Link
 
-    with Link(_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)) as link:
+    with Link(link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)) as link:
         status = link.status()
         records = link.records()
     if as_json:
@@ -499,7 +488,7 @@ def monitor_command(
     from groundstation.link import Link
     from groundstation.views import monitor
 
-    with Link(_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)) as link:
+    with Link(link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)) as link:
         console.print(f"watching '{link.vehicle}'; Ctrl-C ends", highlight=False)
         seen = monitor(link, save, seconds)
     console.print(f"{seen} ticks seen" + (f", written to {escape(str(save))}" if save is not None else ""))

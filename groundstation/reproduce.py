@@ -11,9 +11,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -209,7 +209,9 @@ def prepare(
         samples = samples_of_flights(flights, below)
         done = train(samples, seed=seed)
         versions[name] = below.with_network(done.network)
-        figures[f"{name}: held-out RMS before"] = float(np.sqrt(np.mean(samples.target**2)))
+        figures[f"{name}: held-out RMS before"] = float(
+            np.sqrt(np.mean(samples.target[done.validation] ** 2))
+        )
         figures[f"{name}: held-out RMS"] = done.history[done.best - 1].validation_rms
         figures["noise floor"] = samples.noise_floor
     tell("export")
@@ -255,7 +257,9 @@ def fly_all(
     arms += [(scenarios[0], arm) for arm in ANATOMY[:2]]
 
     def one(task: tuple[Scenario, Arm]) -> Flown:
-        flown = _fly(folder, vehicle, prepared, truth, *task)
+        scenario, arm = task
+        stem = _stem(scenario, arm)
+        flown = _kept(folder / stem, partial(_fly, vehicle, prepared, truth, scenario, arm))
         advance()
         return flown
 
@@ -263,14 +267,25 @@ def fly_all(
         return list(pool.map(one, arms))
 
 
-def _fly(
-    folder: Path, vehicle: Path, prepared: Prepared, truth: Sequence[str], scenario: Scenario, arm: Arm
-) -> Flown:
-    stem = f"{scenario.name}-{arm.name.replace(' ', '-').replace(',', '')}"
-    kept = folder / f"{stem}.json"
+def _stem(scenario: Scenario, arm: Arm) -> str:
+    return f"{scenario.name}-{arm.name.replace(' ', '-').replace(',', '')}"
+
+
+def _kept(path: Path, fly: Callable[[Path], Flown]) -> Flown:
+    """What is known of the flight at `path` (without suffix), flown now where nothing is."""
+    kept = path.with_name(f"{path.name}.json")
     if kept.exists():
-        return _flown(json.loads(kept.read_text(encoding="utf-8")))
-    record = folder / f"{stem}.mcap"
+        table = json.loads(kept.read_text(encoding="utf-8"))
+        return Flown(**{**table, "mse": tuple(table["mse"])})
+    flown = fly(path)
+    kept.write_text(json.dumps(asdict(flown)), encoding="utf-8")
+    return flown
+
+
+def _fly(
+    vehicle: Path, prepared: Prepared, truth: Sequence[str], scenario: Scenario, arm: Arm, path: Path
+) -> Flown:
+    record = path.with_name(f"{path.name}.mcap")
     command: list[object] = ["sim-bridge", "fly", "--trajectory", scenario.trajectory, "--vehicle", vehicle]
     for key, value in scenario.settings(prepared.seed).items():
         command += ["--set", f"{key}={value:g}"]
@@ -281,11 +296,9 @@ def _fly(
     if arm.trim is not None:
         command += ["--trim", arm.trim]
     report = run_json([*command, "-o", record, "--json"])
-    flown = Flown(
+    return Flown(
         prepared.seed, scenario.name, arm.name, track_file(record).mse, report["outcome"], report["guard"]
     )
-    kept.write_text(json.dumps(flown.__dict__), encoding="utf-8")
-    return flown
 
 
 def fly_companion(
@@ -300,24 +313,18 @@ def fly_companion(
     out = []
     for scenario in scenarios:
         for arm in (ARMS[0], ARMS[1], ARMS[4]):
-            out.append(_fly_companion(folder, vehicle, prepared, truth, scenario, arm))
+            path = folder / f"companion-{_stem(scenario, arm)}"
+            out.append(_kept(path, partial(_fly_companion, vehicle, prepared, truth, scenario, arm)))
             advance()
     return out
 
 
 def _fly_companion(
-    folder: Path, vehicle: Path, prepared: Prepared, truth: Sequence[str], scenario: Scenario, arm: Arm
+    vehicle: Path, prepared: Prepared, truth: Sequence[str], scenario: Scenario, arm: Arm, rig: Path
 ) -> Flown:
-    import time
-
     from groundstation.link import Link
     from groundstation.settings import Settings
 
-    stem = f"companion-{scenario.name}-{arm.name.replace(' ', '-')}"
-    kept = folder / f"{stem}.json"
-    if kept.exists():
-        return _flown(json.loads(kept.read_text(encoding="utf-8")))
-    rig = folder / stem
     rig.mkdir(exist_ok=True)
     words = [*truth, "--seed", str(prepared.seed), *scenario.truth]
     mission = {
@@ -334,14 +341,10 @@ def _fly_companion(
         if arm.model:
             link.request("model", prepared.files[arm.model].read_bytes(), 60.0)
         answer = link.request("mission", mission, 30.0)
-        while True:
-            entry = next(m for m in link.status()["missions"] if m["mission"] == answer["mission"])
-            if entry["state"] in ("finished", "failed", "aborted"):
-                break
-            time.sleep(0.3)
+        entry = link.end_of(answer["mission"])
         if entry["state"] != "finished":
             raise InputError(
-                f"{stem}, seed {prepared.seed}: {entry['state']}: {entry['reason']}; see {rig / 'companion.log'}"
+                f"{rig.name}, seed {prepared.seed}: {entry['state']}: {entry['reason']}; see {rig / 'companion.log'}"
             )
         record = link.fetch_record(entry["record"], rig)
     guard = ""
@@ -350,12 +353,6 @@ def _fly_companion(
 
         flags = read_record(record).ticks["guard"]
         guard = next((str(g) for g in flags if "tripped" in str(g)), "active")
-    flown = Flown(
+    return Flown(
         prepared.seed, scenario.name, arm.name, track_file(record).mse, "finished", guard, "companion"
     )
-    kept.write_text(json.dumps(flown.__dict__), encoding="utf-8")
-    return flown
-
-
-def _flown(table: dict[str, Any]) -> Flown:
-    return Flown(**{**table, "mse": tuple(table["mse"])})

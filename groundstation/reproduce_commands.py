@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -165,12 +166,12 @@ def _print(study: Study, scenarios: Sequence[Scenario], companion: bool) -> None
         _print_prepared(prepared)
     names = [arm.name for arm in ARMS]
     table = Table(
-        title="MSE against the expected linear behaviour, m²: median of the vehicles, and half the spread",
+        title="MSE against the expected linear behaviour, m²: median, least and greatest of the vehicles",
         box=box.SIMPLE,
         padding=(0, 1, 0, 0),
     )
     table.add_column("flight", no_wrap=True)
-    for name in (*names[:-1], "both"):
+    for name in ("lqr", "integral", *names[2:-1], "both"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("÷ lqr, int.", justify="right", no_wrap=True)
     rows = [(s.name, s.name, "in-process") for s in scenarios]
@@ -238,9 +239,16 @@ def _print_prepared(prepared: Prepared) -> None:
 def _cell(values: np.ndarray) -> str:
     if values.size == 0:
         return ""
-    median = float(np.median(values))
-    spread = 50.0 * float(np.ptp(values)) / median
-    return _short(median) + (f" ±{spread:.0f}%" if values.size > 1 else "")
+    median, low, high = (float(x) for x in (np.median(values), values.min(), values.max()))
+    if values.size == 1:
+        return _short(median)
+    power = math.floor(math.log10(median))
+    return f"{_short(median)}\n[dim]{_scaled(low, power)}..{_scaled(high, power)}e{power}[/dim]"
+
+
+def _scaled(value: float, power: int) -> str:
+    """`value` in units of ten to `power`, two digits."""
+    return f"{value / 10.0**power:.2g}" if value < 100.0 * 10.0**power else f"{value / 10.0**power:.0f}"
 
 
 def _short(value: float) -> str:

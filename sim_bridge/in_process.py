@@ -190,13 +190,7 @@ def _guard(plan: Plan) -> Guard | None:
     verdict = check_model(plan.model, plan.vehicle)
     if verdict.model is None:
         raise InputError(f"--model: refused: {verdict.reason}")
-    info = verdict.model.info
-    return Guard(
-        verdict.model,
-        info.features,
-        wants_yaw=info.wants_yaw,
-        actuation=info.actuation,
-    )
+    return Guard(verdict.model.watched())
 
 
 def _previews(plan: Plan, period: float) -> Iterator[Preview]:

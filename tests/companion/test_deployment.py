@@ -23,8 +23,8 @@ from onnx_models import (
 from rig import Bridge, Companion, free_port, wait_for
 
 from companion import inspection
-from companion.guard import GuardLimits
 from companion.store import ModelStore
+from companion.watch import GuardLimits
 from models import contract
 from models.record import FlightRecord, read_record
 from models.vehicle import load_vehicle

@@ -11,8 +11,9 @@ import pytest
 
 from companion.control import ControlLaw
 from companion.flight import IDLE, LANDING, MISSION, SILENT, TAKEOFF, Flight, Mission, Outcome, Safety
-from companion.guard import Guard, Range
+from companion.guard import Guard
 from companion.vehicle_link import Latest, Odometry
+from companion.watch import Range, Watch
 from models.contract import FEATURES
 from models.design import load_design
 from models.errors import InputError
@@ -273,7 +274,7 @@ def test_cancelled_before_takeoff_it_streams_no_more() -> None:
 
 def test_the_correction_is_on_when_the_mission_begins_and_off_after_it() -> None:
     ranges = [Range(name, unit, -100.0, 100.0) for name, unit in FEATURES.items()]
-    guard = Guard(lambda features: (1.0, 0.0, 0.0), ranges, name="abc")
+    guard = Guard(Watch(lambda features: (1.0, 0.0, 0.0), ranges, name="abc"))
     rig = Rig()
     rig.take_off(Mission("m1", trajectory("hover", duration=6.0), "corrected", 1, guard))
     climb = rig.run(1.0)

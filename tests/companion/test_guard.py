@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.guard import Guard, GuardLimits, Range
+from companion.guard import Guard
+from companion.watch import GuardLimits, Range, Watch
 from models.contract import FEATURES
 
 LIMITS = GuardLimits(fade=0.5)
@@ -31,7 +32,7 @@ class Clock:
 def guard_of(model, limits=LIMITS, trips=None, clock=None) -> Guard:
     kwargs = {} if clock is None else {"clock": clock}
     on_trip = None if trips is None else lambda name, why: trips.append(why)
-    return Guard(model, RANGES, limits, on_trip=on_trip, **kwargs)
+    return Guard(Watch(model, RANGES, limits, **kwargs), on_trip)
 
 
 def step(guard: Guard, features, dt: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -255,7 +256,7 @@ def test_a_feature_that_is_not_a_number_is_outside_every_range() -> None:
 
 def test_a_feature_that_hardly_moved_in_training_has_a_margin_of_its_unit() -> None:
     ranges = (Range("u_batt", "V", 16.0, 16.0), Range("T", "N", 7.0, 7.0), Range("cos_phi", "1", 1.0, 1.0))
-    guard = Guard(constant(1.0), ranges, LIMITS)
+    guard = Guard(Watch(constant(1.0), ranges, LIMITS))
     guard.start()
     assert run(guard, 1.0, (15.75, 7.0, 1.0))[-1][0] == pytest.approx(0.5)
     assert run(guard, 0.5, (16.0, 7.35, 1.0))[-1][0] == pytest.approx(0.5)
@@ -265,7 +266,7 @@ def test_a_feature_that_hardly_moved_in_training_has_a_margin_of_its_unit() -> N
 def test_near_the_ground_a_model_may_add_thrust_but_take_little_away() -> None:
     def applied(height: float, delta: float) -> float:
         ranges = [Range(name, unit, -100.0, 100.0) for name, unit in FEATURES.items()]
-        guard = Guard(lambda features: (0.0, 0.0, delta), ranges)
+        guard = Guard(Watch(lambda features: (0.0, 0.0, delta), ranges))
         guard.start()
         row = [height, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 16.0, 7.0]
         for _ in range(200):
