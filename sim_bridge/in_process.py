@@ -249,6 +249,11 @@ def record(
 
     try:
         flown = fly(plan, each if len(takers) > 1 else tick)
+    except BaseException:  # nothing has been written yet, and nothing half-written is left
+        recorder.close(timeout=60.0)
+        path.unlink(missing_ok=True)
+        raise
+    try:
         for message, time_us, host in tick.messages:
             recorder.tick(message, time_us, host)
         level = _TICK_EVENT_LEVELS[flown.outcome]

@@ -117,6 +117,22 @@ def test_a_rate_that_does_not_divide_is_refused(vehicle: Vehicle, design: Design
         fly(Plan(vehicle, design, trajectory("hover"), rate=120.0), lambda sample: None)
 
 
+def test_a_flight_that_cannot_begin_leaves_no_record(
+    vehicle: Vehicle, design: Design, tmp_path: Path
+) -> None:
+    path = tmp_path / "x.mcap"
+    for plan, why in (
+        (Plan(vehicle, design, trajectory("hover"), model=b"no model"), "refused"),
+        (
+            Plan(vehicle, replace(design, integral=None), trajectory("hover"), controller="lqr_integral"),
+            "no gains",
+        ),
+    ):
+        with pytest.raises(InputError, match=why):
+            record(plan, path)
+        assert not path.exists()
+
+
 def test_a_flight_that_is_lost_ends(vehicle: Vehicle, design: Design) -> None:
     hidden = choose(["wind:15"], vehicle, 1)
     plan = Plan(vehicle, design, trajectory("hover", height=5.0, duration=60.0), hidden)
