@@ -1,0 +1,1 @@
+SECTIONS=Section=render=write_report=None

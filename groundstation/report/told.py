@@ -1,0 +1,128 @@
+"""Numbers in texts: every one is looked up in the table that `--json` prints, and says where it stands there."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+
+class Told:
+    """A part of the JSON table that knows its place in it.
+
+    Texts stand as they are; a number has to go through the filter `num`, which says how it is written.
+    """
+
+    __slots__ = ("path", "raw")
+
+    def __init__(self, raw: Any, path: str = "") -> None:
+        self.raw, self.path = raw, path
+
+    def __getitem__(self, key: str | int) -> Told:
+        return Told(self.raw[key], f"{self.path}.{key}" if self.path else str(key))
+
+    def __getattr__(self, name: str) -> Told:
+        if isinstance(self.raw, dict) and name in self.raw:
+            return self[name]
+        raise AttributeError(f"nothing is told of '{self.path}.{name}'")
+
+    def __iter__(self) -> Iterator[Told]:
+        return (self[k] for k in range(len(self.raw)))
+
+    def __len__(self) -> int:
+        return len(self.raw)
+
+    def __bool__(self) -> bool:
+        return bool(self.raw)
+
+    def __eq__(self, other: object) -> bool:
+        return bool(self.raw == (other.raw if isinstance(other, Told) else other))
+
+    def __hash__(self) -> int:
+        return hash(self.path)
+
+    def __contains__(self, item: object) -> bool:
+        return item in self.raw
+
+    def __str__(self) -> str:
+        if isinstance(self.raw, str):
+            return self.raw
+        raise TypeError(f"'{self.path}' is no text: write it with the filter num")
+
+    def __html__(self) -> str:
+        return str(Markup('<span data-path="{}">{}</span>').format(self.path, str(self)))
+
+    def each(self) -> Iterator[tuple[str, Told]]:
+        """Key and value of each entry."""
+        return ((key, self[key]) for key in self.raw)
+
+
+def written(value: float | None, spec: str, scale: float = 1.0) -> str:
+    """A number as people read it: `spec` of `format`, or "percent", or "change" (a signed percentage)."""
+    if value is None:
+        return "–"
+    x = scale * value
+    if spec == "percent":
+        return f"{100 * x:.0f} %" if abs(x) >= 0.01 or x == 0.0 else f"{100 * x:.1f} %"
+    if spec == "change":
+        return f"{100 * x:+.0f} %".replace("-", "−")
+    text = format(x, spec)
+    if "e" in text:
+        mantissa, exponent = text.split("e")
+        text = f"{mantissa}·10^{int(exponent)}"
+    return text.replace("-", "−")
+
+
+def _as_html(told: Told, spec: str, scale: float = 1.0) -> Markup:
+    return Markup('<data value="{}" data-path="{}" data-spec="{}" data-scale="{}">{}</data>').format(
+        json.dumps(told.raw), told.path, spec, f"{scale:g}", written(told.raw, spec, scale)
+    )
+
+
+def _as_text(told: Told, spec: str, scale: float = 1.0) -> str:
+    return written(told.raw, spec, scale)
+
+
+UNITS = {"m/s^2": "m/s²", "rad/s^2": "rad/s²", "m^2": "m²", "1": ""}
+
+
+def unit(told: Told | str) -> str:
+    """A unit as people write it, with the space before it; nothing for a bare number."""
+    name = str(told)
+    name = UNITS.get(name, name)
+    return f" {name}" if name else ""
+
+
+def _code(text: Told | str) -> Markup:
+    """A text with what stands after "groundstation" as code."""
+    found = re.sub(r"(groundstation [a-z_ -]+[a-z_])", r"<code>\1</code>", str(escape(str(text))))
+    if isinstance(text, Told):
+        return Markup('<span data-path="{}">{}</span>').format(text.path, Markup(found))
+    return Markup(found)
+
+
+def environment(html: bool) -> Environment:
+    """Templates of the report, for HTML or for Markdown; whatever a template names must be there."""
+    made = Environment(
+        loader=PackageLoader("groundstation.report"),
+        autoescape=html,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters["num"] = _as_html if html else _as_text
+    made.filters["unit"] = unit
+    made.filters["code"] = _code
+    made.filters["raw"] = lambda told: told.raw
+    return made
+
+
+def sentences(table: dict[str, Any], html: bool) -> list[str]:
+    """The verdict of an analysis (its JSON table) in plain words, the outcome first."""
+    text = environment(html).get_template("verdict.txt").render(t=Told(table))
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    return [Markup(line) if html else line for line in lines if line]
