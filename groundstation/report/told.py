@@ -17,48 +17,48 @@ class Told:
     Texts stand as they are; a number has to go through the filter `num`, which says how it is written.
     """
 
-    __slots__ = ("path", "raw")
+    __slots__ = ("_path", "_raw")
 
     def __init__(self, raw: Any, path: str = "") -> None:
-        self.raw, self.path = raw, path
+        self._raw, self._path = raw, path
 
     def __getitem__(self, key: str | int) -> Told:
-        return Told(self.raw[key], f"{self.path}.{key}" if self.path else str(key))
+        return Told(self._raw[key], f"{self._path}.{key}" if self._path else str(key))
 
     def __getattr__(self, name: str) -> Told:
-        if isinstance(self.raw, dict) and name in self.raw:
+        if isinstance(self._raw, dict) and name in self._raw:
             return self[name]
-        raise AttributeError(f"nothing is told of '{self.path}.{name}'")
+        raise AttributeError(f"nothing is told of '{self._path}.{name}'")
 
     def __iter__(self) -> Iterator[Told]:
-        return (self[k] for k in range(len(self.raw)))
+        return (self[k] for k in range(len(self._raw)))
 
     def __len__(self) -> int:
-        return len(self.raw)
+        return len(self._raw)
 
     def __bool__(self) -> bool:
-        return bool(self.raw)
+        return bool(self._raw)
 
     def __eq__(self, other: object) -> bool:
-        return bool(self.raw == (other.raw if isinstance(other, Told) else other))
+        return bool(self._raw == (other._raw if isinstance(other, Told) else other))
 
     def __hash__(self) -> int:
-        return hash(self.path)
+        return hash(self._path)
 
     def __contains__(self, item: object) -> bool:
-        return item in self.raw
+        return item in self._raw
 
     def __str__(self) -> str:
-        if isinstance(self.raw, str):
-            return self.raw
-        raise TypeError(f"'{self.path}' is no text: write it with the filter num")
+        if isinstance(self._raw, str):
+            return self._raw
+        raise TypeError(f"'{self._path}' is no text: write it with the filter num")
 
     def __html__(self) -> str:
-        return str(Markup('<span data-path="{}">{}</span>').format(self.path, str(self)))
+        return str(Markup('<span data-path="{}">{}</span>').format(self._path, str(self)))
 
     def each(self) -> Iterator[tuple[str, Told]]:
         """Key and value of each entry."""
-        return ((key, self[key]) for key in self.raw)
+        return ((key, self[key]) for key in self._raw)
 
 
 def written(value: float | None, spec: str, scale: float = 1.0) -> str:
@@ -79,12 +79,12 @@ def written(value: float | None, spec: str, scale: float = 1.0) -> str:
 
 def _as_html(told: Told, spec: str, scale: float = 1.0) -> Markup:
     return Markup('<data value="{}" data-path="{}" data-spec="{}" data-scale="{}">{}</data>').format(
-        json.dumps(told.raw), told.path, spec, f"{scale:g}", written(told.raw, spec, scale)
+        json.dumps(told._raw), told._path, spec, f"{scale:g}", written(told._raw, spec, scale)
     )
 
 
 def _as_text(told: Told, spec: str, scale: float = 1.0) -> str:
-    return written(told.raw, spec, scale)
+    return written(told._raw, spec, scale)
 
 
 UNITS = {"m/s^2": "m/s²", "rad/s^2": "rad/s²", "m^2": "m²", "1": ""}
@@ -101,7 +101,7 @@ def _code(text: Told | str) -> Markup:
     """A text with what stands after "groundstation" as code."""
     found = re.sub(r"(groundstation [a-z_ -]+[a-z_])", r"<code>\1</code>", str(escape(str(text))))
     if isinstance(text, Told):
-        return Markup('<span data-path="{}">{}</span>').format(text.path, Markup(found))
+        return Markup('<span data-path="{}">{}</span>').format(text._path, Markup(found))
     return Markup(found)
 
 
@@ -117,7 +117,7 @@ def environment(html: bool) -> Environment:
     made.filters["num"] = _as_html if html else _as_text
     made.filters["unit"] = unit
     made.filters["code"] = _code
-    made.filters["raw"] = lambda told: told.raw
+    made.filters["raw"] = lambda told: told._raw
     return made
 
 

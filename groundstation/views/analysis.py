@@ -60,7 +60,7 @@ def _verdict(stream: rr.RecordingStream, a: Analysis, table: dict[str, Any]) -> 
     colours: tuple[Colour, ...] = (WARNING, NEWEST)
     ranked = [e for e in a.diagnosis.effects if e.rank]
     shares: list[rrb.View] = []
-    if ranked:
+    if len(ranked) > 1:
         groups = [
             (e.name, colours[k % 2], [0.0] * k + [100 * e.variance_share] + [0.0] * (len(ranked) - 1 - k))
             for k, e in enumerate(ranked)

@@ -74,7 +74,7 @@ def error_path(
     if worst:
         middles = [0.5 * (m.start + m.end) for m in worst[:MARKED]]
         places = np.stack([np.interp(middles, flight.t, axis) for axis in position.T], -1)
-        labels = [f"{m.rms:.2f} m/s² at {m.start:.1f} s" for m in worst[:MARKED]]
+        labels = [f"worst {number}" for number in range(1, len(places) + 1)]
         marks = rr.Points3D(
             places, labels=labels, radii=0.012 * size, colors=[(255, 255, 255)], show_labels=True
         )
@@ -110,11 +110,8 @@ def error_curves(
         curve(stream, f"{root}/{number}", t, error.values, label, colour, 2.0)
     floor = np.full(2, errors[-1][1].comparison.noise_floor)
     curve(stream, f"{root}/floor", np.array([start, end]), floor, "noise floor", FLOOR)
-    for number, moment in enumerate(worst):
-        t, over = np.array([moment.start, moment.start, moment.end, moment.end]), moment.rms
-        box = np.array([0.0, over, over, 0.0])
-        # one name for all in the legend; a curve without a name would show its path
-        curve(stream, f"{root}/worst/{number}", t, box, f"worst {number + 1}", WARNING, 3.0)
+    if worst:
+        _mark(stream, f"{root}/worst", worst)
     return rrb.TimeSeriesView(
         origin=root,
         name=name,
@@ -122,6 +119,18 @@ def error_curves(
         axis_y=rrb.ScalarAxis(range=(0.0, 1.1 * highest)),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=len(errors) > 1),
     )
+
+
+def _mark(stream: rr.RecordingStream, path: str, worst: Sequence[Moment]) -> None:
+    """Each worst stretch as a bar at its RMS, all in one curve."""
+    ordered = sorted(worst, key=lambda m: m.start)
+    t = np.array([x for m in ordered for x in (m.start, m.end, m.end + 1e-6)])
+    values = np.array([x for m in ordered for x in (m.rms, m.rms, np.nan)])
+    # drawn point by point: averaged over pixels, a gap would swallow its neighbours
+    lines = rr.SeriesLines(colors=[WARNING], names="worst moments", widths=[5.0], aggregation_policy="Off")
+    stream.log(path, lines, static=True)
+    times = rr.TimeColumn(TIME, duration=t)
+    stream.send_columns(path, indexes=[times], columns=rr.Scalars.columns(scalars=values))
 
 
 def moments_log(stream: rr.RecordingStream, path: str, worst: Sequence[Moment], name: str) -> rrb.TextLogView:

@@ -71,15 +71,19 @@ def where_panel(
         for m in where.maps
         if m.variable != "time"
     ][:MAPS]
+    told: rrb.View | rrb.Container = rrb.TextDocumentView(
+        origin=f"{root}regions", name="where the error sits"
+    )
     if where.place is not None and space is not None:
-        maps.append(_place(stream, where.place, error, f"{root}place"))
+        place = _place(stream, where.place, error, f"{root}place")
+        told = rrb.Horizontal(told, place, column_shares=[3, 2])
     rows = [rrb.Horizontal(*maps[k : k + 2]) for k in range(0, len(maps), 2)]
     return rrb.Horizontal(
         rrb.Vertical(*views, row_shares=shares),
         rrb.Vertical(
-            rrb.TextDocumentView(origin=f"{root}regions", name="where the error sits"),
+            told,
             *rows,
-            row_shares=[1.4, *[1.0] * len(rows)],
+            row_shares=[1.5, *[1.0] * len(rows)],
         ),
         column_shares=[1, 1],
         name="where it fails",
