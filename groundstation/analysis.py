@@ -145,8 +145,19 @@ def analyse(
         _tracked(flight, design),
         _reference(flight),
         side_by_side,
-        provenance(flight, *(() if validation is None else (validation,))),
+        provenance(*_roles(flight, validation, side_by_side)),
     )
+
+
+def _roles(
+    flight: Flight, validation: Flight | None, side_by_side: SideBySide | None
+) -> list[tuple[str, Flight]]:
+    roles = [("flight", flight)]
+    if validation is not None:
+        roles.append(("held-out flight", validation))
+    if side_by_side is not None:
+        roles += [("beside", c.flight) for c in side_by_side.comparisons]
+    return roles
 
 
 def steps_to(diagnosis: Diagnosis, bandwidth: float | None = None) -> list[Model]:
@@ -161,9 +172,7 @@ def steps_to(diagnosis: Diagnosis, bandwidth: float | None = None) -> list[Model
         through = {n: effect_named(n, base.effects_directory).with_any for n in waiting}
         order.append(next((n for n in waiting if not through[n] or present & set(through[n])), waiting[0]))
         waiting.remove(order[-1])
-    problem = Problem(
-        (measure(diagnosis.flight, bandwidth),), base.effects_directory, base.network_chain()
-    )
+    problem = Problem((measure(diagnosis.flight, bandwidth),), base.effects_directory, base.network_chain())
     steps = []
     for count in range(1, len(order)):
         terms = [*base.terms, *(Term(name, {}) for name in order[:count])]
@@ -201,15 +210,16 @@ def _reference(flight: Flight) -> ReferenceDistance | None:
     return ReferenceDistance((x, y, z), float(len(rows) * flight.dt))
 
 
-def provenance(*flights: Flight) -> Provenance:
-    """The files of `flights` and of their vehicles, the running command and the versions that make the figures."""
-    files: list[SourceFile] = []
-    for number, flight in enumerate(flights):
-        role = "flight" if number == 0 else "held-out flight"
-        files.append(SourceFile(role, flight.origin, flight.data_hash))
+def provenance(*flights: tuple[str, Flight]) -> Provenance:
+    """The files of `flights` (role, flight) and of their vehicles, the running command and the versions that make the
+    figures."""
+    files: dict[str, SourceFile] = {}
+    for role, flight in flights:
+        files.setdefault(flight.origin, SourceFile(role, flight.origin, flight.data_hash))
         vehicle = Path(flight.vehicle.source)
-        if vehicle.is_file() and str(vehicle) not in [f.path for f in files]:
-            files.append(SourceFile("vehicle", str(vehicle), hashlib.sha256(vehicle.read_bytes()).hexdigest()))
+        if str(vehicle) not in files and vehicle.is_file():
+            digest = hashlib.sha256(vehicle.read_bytes()).hexdigest()
+            files[str(vehicle)] = SourceFile("vehicle", str(vehicle), digest)
     versions = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
@@ -217,4 +227,6 @@ def provenance(*flights: Flight) -> Provenance:
         except PackageNotFoundError:
             continue
     command = shlex.join([Path(sys.argv[0]).name.removesuffix(".py"), *sys.argv[1:]])
-    return Provenance(datetime.now(UTC).isoformat(timespec="seconds"), command, tuple(files), versions)
+    return Provenance(
+        datetime.now(UTC).isoformat(timespec="seconds"), command, tuple(files.values()), versions
+    )

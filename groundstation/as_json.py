@@ -172,7 +172,8 @@ def side_by_side_table(s: SideBySide) -> dict[str, Any]:
                 "share_of_time": [None if x is None else x.share_of_time for x in all_],
             }
         )
-    return plain({"rows": rows, "maps": maps})
+    flights = len({id(c.flight) for c in s.comparisons}) > 1
+    return plain({"of": "flights" if flights else "models", "rows": rows, "maps": maps})
 
 
 def _regions(w: WhereItFails) -> dict[str, Any]:
@@ -211,7 +212,11 @@ def analysis_table(a: Analysis) -> dict[str, Any]:
         "tracking": None if a.tracking is None else tracking_table(a.tracking),
         "reference": None
         if a.reference is None
-        else {"rms": dict(zip("xyz", a.reference.rms, strict=True)), "seconds": a.reference.seconds, "unit": "m"},
+        else {
+            "rms": dict(zip("xyz", a.reference.rms, strict=True)),
+            "seconds": a.reference.seconds,
+            "unit": "m",
+        },
         "side_by_side": None if a.side_by_side is None else side_by_side_table(a.side_by_side),
         "titles": {e.name: effect_named(e.name, d.base.effects_directory).title for e in d.effects},
         "provenance": asdict(a.provenance),

@@ -10,6 +10,7 @@ from groundstation import (
     collect_commands,
     flight_commands,
     pilot_commands,
+    report_commands,
     reproduce_commands,
     train_commands,
 )
@@ -26,6 +27,7 @@ app = typer.Typer(
 )
 flight_commands.register(app)
 analysis_commands.register(app)
+report_commands.register(app)
 bound_commands.register(app)
 train_commands.register(app)
 pilot_commands.register(app)

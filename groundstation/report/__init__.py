@@ -1,5 +1,5 @@
 """One self-contained HTML page of an analysis, for those who were not there."""
 
-from groundstation.report.page import SECTIONS, Section, render, write_report
+from groundstation.report.page import SECTIONS, Section, chosen, render, render_side_by_side, write_report
 
-__all__ = ["SECTIONS", "Section", "render", "write_report"]
+__all__ = ["SECTIONS", "Section", "chosen", "render", "render_side_by_side", "write_report"]

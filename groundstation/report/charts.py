@@ -8,11 +8,12 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from groundstation.analysis import Analysis
-from groundstation.results import Comparison
-from groundstation.report.svg import BESIDE, COLOURS, ERROR, LEVELS, figure, legend, level, to_svg
+from groundstation.report.svg import BESIDE, COLOURS, ERROR, LEVELS, figure, level, to_svg
 from groundstation.report.told import unit
+from groundstation.results import Comparison
 from groundstation.side_by_side import SideBySide
 from groundstation.tracking import Tracking
 from groundstation.views.error import rolling_rms
@@ -46,12 +47,14 @@ def waterfall(table: Table) -> Markup:
         ax.barh(
             y + 0.2, [s["held_out"] for s in steps], height, color=COLOURS["held"], label="held-out flight"
         )
-    ax.axvline(steps[-1]["noise_floor"], color=COLOURS["ink"], linewidth=1.2, dashes=(4, 2), label="noise floor")
+    ax.axvline(
+        steps[-1]["noise_floor"], color=COLOURS["ink"], linewidth=1.2, dashes=(4, 2), label="noise floor"
+    )
     ax.set_yticks(y, [s["label"] for s in steps])
     ax.invert_yaxis()
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("residual RMS, m/s²")
-    legend(ax, loc="lower right")
+    ax.legend(loc="lower right")
     told = "; ".join(
         f"{s['label']} {s['fitted']:.3f}" + (f", held out {s['held_out']:.3f}" if held else "") for s in steps
     )
@@ -61,7 +64,9 @@ def waterfall(table: Table) -> Markup:
 def prediction(a: Analysis) -> Markup:
     """Measured and predicted acceleration around the worst moment, per axis."""
     flight = a.flight
-    middle = 0.5 * (a.where.worst[0].start + a.where.worst[0].end) if a.where.worst else float(np.median(flight.t))
+    middle = (
+        0.5 * (a.where.worst[0].start + a.where.worst[0].end) if a.where.worst else float(np.median(flight.t))
+    )
     last = max(float(flight.t[0]), float(flight.t[-1]) - WINDOW)
     start = float(np.clip(middle - 0.5 * WINDOW, flight.t[0], last))
     rows = np.flatnonzero((flight.t >= start) & (flight.t <= start + WINDOW))[:: max(1, len(flight) // 20000)]
@@ -78,9 +83,11 @@ def prediction(a: Analysis) -> Markup:
         ax.set_ylabel(f"{'xyz'[k]}, m/s²")
         for m in a.where.worst:
             if m.start < t[-1] and m.end > t[0]:
-                ax.axvspan(max(m.start, t[0]), min(m.end, t[-1]), color=COLOURS["worst"], alpha=0.18, linewidth=0)
+                ax.axvspan(
+                    max(m.start, t[0]), min(m.end, t[-1]), color=COLOURS["worst"], alpha=0.18, linewidth=0
+                )
     axes[-1, 0].set_xlabel("time, s (worst moments shaded)")
-    legend(axes[0, 0], loc="upper right", ncols=3)
+    axes[0, 0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2)
     names = " and ".join(c.label for c, _ in curves)
     return to_svg(
         made,
@@ -104,15 +111,17 @@ def over_time(a: Analysis) -> Markup:
         ax.axvspan(m.start, m.end, color=COLOURS["worst"], alpha=0.3, linewidth=0)
         ax.annotate(
             str(number), (0.5 * (m.start + m.end), 1.0), xycoords=("data", "axes fraction"),
-            ha="center", va="bottom", color=COLOURS["ink"],
+            ha="center", va="bottom", fontsize=7.0, color=COLOURS["ink"],
         )  # fmt: skip
     ax.set_ylim(bottom=0.0)
     ax.set_xlim(a.flight.t[0], a.flight.t[-1])
     ax.set_xlabel("time, s")
     ax.set_ylabel("m/s²")
-    legend(ax, loc="upper right", ncols=3)
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.08), ncols=3, borderaxespad=0.2)
     return to_svg(
-        made, "overtime", f"Residual RMS over {SMOOTHING:g} s along the flight, worst moments numbered and shaded."
+        made,
+        "overtime",
+        f"Residual RMS over {SMOOTHING:g} s along the flight, worst moments numbered and shaded.",
     )
 
 
@@ -136,7 +145,7 @@ def maps(table: Table) -> Markup:
         if names[1] != names[0]:
             _stairs(ax, edges, left[m["variable"]]["rms"], COLOURS["after"], names[1], filled=False)
         _label(ax, m)
-    legend(axes[0], loc="lower left")
+    axes[0].legend(loc="lower left")
     told = ", ".join(m["variable"] for m in before)
     return to_svg(made, "maps", f"Residual RMS in m/s² over {told}; the numbers stand in the tables below.")
 
@@ -150,10 +159,20 @@ def _grid(count: int) -> tuple[Any, list[Any]]:
     return made, flat
 
 
-def _stairs(ax: Any, edges: np.ndarray, rms: list[float | None], colour: str, name: str, filled: bool) -> None:
+def _stairs(
+    ax: Any, edges: np.ndarray, rms: list[float | None], colour: str, name: str, filled: bool
+) -> None:
     values = np.array([np.nan if v is None else v for v in rms])
     if filled:
-        ax.bar(edges[:-1], np.nan_to_num(values), np.diff(edges), align="edge", color=colour, alpha=0.55, label=name)
+        ax.bar(
+            edges[:-1],
+            np.nan_to_num(values),
+            np.diff(edges),
+            align="edge",
+            color=colour,
+            alpha=0.55,
+            label=name,
+        )
     else:
         middle = 0.5 * (edges[1:] + edges[:-1])
         ax.plot(middle, values, color=colour, linewidth=1.6, marker="o", markersize=2.8, label=name)
@@ -165,6 +184,7 @@ def _label(ax: Any, m: Table) -> None:
     ax.set_ylim(bottom=0.0)
     ax.set_xlim(m["edges"][0], m["edges"][-1])
     ax.grid(axis="x", visible=False)
+    ax.xaxis.set_major_locator(MaxNLocator(4))
 
 
 def path(a: Analysis) -> Markup | None:
@@ -172,13 +192,13 @@ def path(a: Analysis) -> Markup | None:
     c, flight = a.before, a.flight
     if flight.position is None:
         return None
-    values = rolling_rms(c.residual, c.used, round(SMOOTHING / flight.dt))
+    values, highest = _scale(c)
     good = np.all(np.isfinite(flight.position), axis=1)
     if not np.any(good & np.isfinite(values)):
         return None
-    highest = float(np.nanquantile(values, 0.99))
-    span = np.ptp(flight.position[good], axis=0)
-    made, axes = figure(1, 2, WIDTH, float(np.clip(3.4 * max(span[1], span[2], 0.4) / max(span[0], 0.4), 2.2, 3.8)))
+    span = np.maximum(np.ptp(flight.position[good], axis=0), 0.4)
+    tall = 3.0 * max(span[1], span[2]) / span[0]
+    made, axes = figure(1, 2, WIDTH, 1.2 + float(np.clip(tall, 1.6, 3.4)))
     rows = np.flatnonzero(good)[:: max(1, int(good.sum()) // SEGMENTS)]
     steps = level(values[rows], highest)
     for ax, (across, up), names in (
@@ -190,7 +210,9 @@ def path(a: Analysis) -> Markup | None:
         for number, m in enumerate(a.where.worst[:3], 1):
             k = int(np.argmin(np.abs(flight.t - 0.5 * (m.start + m.end))))
             place = flight.position[k, [across, up]]
-            ax.plot(*place, marker="o", markersize=9, markerfacecolor="none", color=COLOURS["ink"], linewidth=1)
+            ax.plot(
+                *place, marker="o", markersize=9, markerfacecolor="none", color=COLOURS["ink"], linewidth=1
+            )
             ax.annotate(str(number), place, xytext=(6, 6), textcoords="offset points", color=COLOURS["ink"])
         ax.set_aspect("equal", adjustable="datalim")
         ax.autoscale_view()
@@ -199,9 +221,7 @@ def path(a: Analysis) -> Markup | None:
     axes[0, 0].set_title("from above")
     axes[0, 1].set_title("from the south")
     bounds = np.linspace(0.0, highest, LEVELS + 1)
-    patches = [
-        Patch(color=ERROR[k], label=f"{bounds[k]:.2g}–{bounds[k + 1]:.2g}") for k in range(0, LEVELS)
-    ]
+    patches = [Patch(color=ERROR[k], label=f"{bounds[k]:.2g}–{bounds[k + 1]:.2g}") for k in range(0, LEVELS)]
     made.legend(
         handles=patches, loc="outside lower center", ncols=LEVELS, frameon=False, fontsize=7.5,
         title="residual RMS, m/s²", labelcolor=COLOURS["ink"], handlelength=1.0, columnspacing=0.9,
@@ -212,6 +232,13 @@ def path(a: Analysis) -> Markup | None:
         f"The path from above and from the south, coloured by the residual of {c.label}; dark, thick parts are worst, "
         "the three worst moments are numbered.",
     )
+
+
+def _scale(c: Comparison) -> tuple[np.ndarray, float]:
+    """The residual along the flight, RMS over `SMOOTHING` s, and where its colours end."""
+    values = rolling_rms(c.residual, c.used, round(SMOOTHING / c.flight.dt))
+    finite = values[np.isfinite(values)]
+    return values, float(np.quantile(finite, 0.99)) if finite.size else 1.0
 
 
 def _coloured(ax: Any, points: np.ndarray, steps: np.ndarray) -> None:
@@ -225,31 +252,39 @@ def _coloured(ax: Any, points: np.ndarray, steps: np.ndarray) -> None:
         # round caps close the joints between differently coloured pieces
         ax.add_collection(
             LineCollection(
-                list(lines), colors=[colour], linewidths=0.8 if k < 0 else 0.9 + 0.3 * k, capstyle="round", zorder=2 + k
+                list(lines),
+                colors=[colour],
+                linewidths=0.8 if k < 0 else 0.9 + 0.3 * k,
+                capstyle="round",
+                zorder=2 + k,
             )
         )
     ax.plot(points[:, 0], points[:, 1], alpha=0.0)
 
 
-def place(table: Table) -> Markup | None:
-    """The residual over the ground, in cells; None without position."""
+def place(a: Analysis, table: Table) -> Markup | None:
+    """The residual over the ground, in cells and in the colours of the path; None without position."""
     told = table["where"]["place"]
     if told is None:
         return None
     centres, rms = np.array(told["centres"]), np.array(told["rms"], dtype=float)
     made, axes = figure(1, 1, 4.2, 3.4)
     ax, cell = axes[0, 0], told["cell"]
-    steps = level(rms, float(np.quantile(rms, 0.99)))
+    steps = level(rms, _scale(a.before)[1])
     for k in range(LEVELS):
         cells = [Rectangle((x - cell / 2, y - cell / 2), cell, cell) for x, y in centres[steps == k]]
         if cells:
-            ax.add_collection(PatchCollection(cells, facecolors=[ERROR[k]], edgecolors="none"))
+            ax.add_collection(
+                PatchCollection(cells, facecolors=[ERROR[k]], edgecolors="none", antialiased=False)
+            )
     ax.plot(centres[:, 0], centres[:, 1], alpha=0.0)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("east, m")
     ax.set_ylabel("north, m")
     return to_svg(
-        made, "place", f"Residual RMS over the ground in cells of {cell:g} m, from {rms.min():.2f} to {rms.max():.2f} m/s²."
+        made,
+        "place",
+        f"Residual RMS over the ground in cells of {cell:g} m, from {rms.min():.2f} to {rms.max():.2f} m/s².",
     )
 
 
@@ -264,7 +299,9 @@ def tracking(t: Tracking) -> Markup:
         ax.set_ylabel(f"{'xyz'[k]}, cm")
         ax.axhline(0.0, color=COLOURS["muted"], linewidth=0.7)
     axes[-1, 0].set_xlabel("time, s")
-    return to_svg(made, "tracking", "Flown minus expected position of the linear design along each world axis, cm.")
+    return to_svg(
+        made, "tracking", "Flown minus expected position of the linear design along each world axis, cm."
+    )
 
 
 def beside_maps(table: Table) -> Markup:
@@ -278,9 +315,11 @@ def beside_maps(table: Table) -> Markup:
                 colour = BESIDE[k % len(BESIDE)]
                 _stairs(ax, np.array(m["edges"]), m["rms"][k], colour, row["name"], filled=False)
         _label(ax, m)
-    legend(axes[0], loc="best")
+    axes[0].legend(loc="best")
     names = " and ".join(row["name"] for row in beside["rows"])
-    return to_svg(made, "beside", f"Residual RMS of {names} over the same bins; the numbers stand in the tables below.")
+    return to_svg(
+        made, "beside", f"Residual RMS of {names} over the same bins; the numbers stand in the tables below."
+    )
 
 
 def beside_over_time(beside: SideBySide) -> Markup:
@@ -292,7 +331,9 @@ def beside_over_time(beside: SideBySide) -> Markup:
     ax.set_ylim(bottom=0.0)
     ax.set_xlabel("time since the start of the flight, s")
     ax.set_ylabel("m/s²")
-    legend(ax, loc="upper right", ncols=3)
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2)
     return to_svg(
-        made, "besidetime", f"Residual RMS over {SMOOTHING:g} s of {' and '.join(beside.names)} along the flight."
+        made,
+        "besidetime",
+        f"Residual RMS over {SMOOTHING:g} s of {' and '.join(beside.names)} along the flight.",
     )

@@ -9,8 +9,9 @@ from typing import Any
 
 from markupsafe import Markup
 
-from groundstation.analysis import Analysis, Provenance
+from groundstation.analysis import Analysis
 from groundstation.report import charts
+from groundstation.report.svg import style
 from groundstation.report.told import Told, environment, sentences
 from groundstation.side_by_side import SideBySide
 from models.errors import InputError
@@ -50,7 +51,7 @@ SECTIONS: tuple[Section, ...] = (
     Section(
         "where",
         "Where it fails",
-        lambda a, t: {"path": charts.path(a), "maps": charts.maps(t), "place": charts.place(t)},
+        lambda a, t: {"path": charts.path(a), "maps": charts.maps(t), "place": charts.place(a, t)},
     ),
     Section("worst", "Worst moments", _none),
     Section(
@@ -88,22 +89,29 @@ def chosen(without: Sequence[str]) -> tuple[Section, ...]:
 def render(analysis: Analysis, table: Table, sections: Sequence[Section] = SECTIONS) -> str:
     """The page as HTML. `table` is the JSON of `analysis`: every number in the page is read from it."""
     html, told = environment(html=True), Told(table)
-    bodies = [
-        (section, _body(html, section, section.charts(analysis, table), told))
-        for section in sections
-        if all(table.get(need) for need in section.needs)
-    ]
+    with style():
+        bodies = [
+            (section, _body(html, section, section.charts(analysis, table), told))
+            for section in sections
+            if all(table.get(need) for need in section.needs)
+        ]
     return html.get_template("report.html").render(
-        t=told, verdict=sentences(table, html=True), title=f"{table['flight']}: what is missing", sections=bodies
+        t=told,
+        verdict=sentences(table, html=True),
+        title=f"{table['flight']}: what is missing",
+        sections=bodies,
     )
 
 
-def render_side_by_side(beside: SideBySide, table: Table, provenance: Provenance) -> str:
-    """A page of comparisons side by side alone; `table` holds their JSON under "side_by_side"."""
+def render_side_by_side(beside: SideBySide, table: Table) -> str:
+    """A page of comparisons side by side alone; `table` holds their JSON under "side_by_side", and
+    "provenance"."""
     html, told = environment(html=True), Told(table)
     wanted = {s.name: s for s in SECTIONS}
+    with style():
+        drawn = _beside(beside, table)
     bodies = [
-        (wanted["side_by_side"], _body(html, wanted["side_by_side"], _beside(beside, table), told)),
+        (wanted["side_by_side"], _body(html, wanted["side_by_side"], drawn, told)),
         (wanted["provenance"], _body(html, wanted["provenance"], {}, told)),
     ]
     lines = html.get_template("beside.txt").render(t=told).splitlines()
@@ -124,6 +132,8 @@ def write_report(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
         partial.replace(path)
     except OSError as error:
-        raise InputError(f"{path}: cannot write the report ({error.strerror}); choose another --output") from None
+        raise InputError(
+            f"{path}: cannot write the report ({error.strerror}); choose another --output"
+        ) from None
     finally:
         partial.unlink(missing_ok=True)

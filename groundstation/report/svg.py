@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import io
 import re
+from contextlib import AbstractContextManager
 
 import matplotlib
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 COLOURS = {
@@ -51,21 +51,26 @@ STYLE = {
 }
 
 
-def figure(rows: int, columns: int, width: float, height: float, **more: object) -> tuple[Figure, np.ndarray]:
+def figure(
+    rows: int, columns: int, width: float, height: float, sharex: bool = False
+) -> tuple[Figure, np.ndarray]:
     """A figure of `width` by `height` inches with its axes (rows, columns)."""
-    with matplotlib.rc_context(STYLE):
-        made = Figure(figsize=(width, height), layout="constrained", facecolor="none")
-        axes = made.subplots(rows, columns, squeeze=False, **more)  # type: ignore[arg-type]
-        for one in axes.flat:
-            one.set_facecolor("none")
+    made = Figure(figsize=(width, height), layout="constrained", facecolor="none")
+    axes = made.subplots(rows, columns, squeeze=False, sharex=sharex)
+    for one in axes.flat:
+        one.set_facecolor("none")
     return made, axes
+
+
+def style() -> AbstractContextManager[None]:
+    """While it holds, figures are drawn in the style of the page."""
+    return matplotlib.rc_context(STYLE)
 
 
 def to_svg(made: Figure, name: str, alt: str) -> Markup:
     """The figure as one inline element; `alt` says in words what it shows."""
     out = io.StringIO()
-    with matplotlib.rc_context(STYLE):
-        made.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
+    made.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
     text = out.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
@@ -92,9 +97,3 @@ def level(values: np.ndarray, highest: float) -> np.ndarray:
     """Step (N,) of the error's scale, 0 to 7; -1 where there is no value."""
     place = np.clip(np.nan_to_num(values) / max(highest, 1e-12) * LEVELS, 0, LEVELS - 1).astype(int)
     return np.where(np.isfinite(values), place, -1)
-
-
-def legend(axes: Axes, **more: object) -> None:
-    """A legend in the page's style."""
-    with matplotlib.rc_context(STYLE):
-        axes.legend(**more)  # type: ignore[arg-type]

@@ -12,8 +12,8 @@ from groundstation.views.where import write_where
 
 __all__ = [
     "monitor",
-    "write_analysis",
     "write_ablation",
+    "write_analysis",
     "write_before_after",
     "write_comparison",
     "write_side_by_side",

@@ -73,7 +73,9 @@ def _verdict(stream: rr.RecordingStream, a: Analysis, table: dict[str, Any]) -> 
     ]
     name = f"residual over the flight, RMS over {SMOOTHING:g} s, m/s² (worst moments marked)"
     curves = error_curves(stream, "verdict/residual", versions, name, a.where.worst)
-    marks = moments_log(stream, "verdict/moments", a.where.worst, "worst moments (click on a time to go there)")
+    marks = moments_log(
+        stream, "verdict/moments", a.where.worst, "worst moments (click on a time to go there)"
+    )
     return rrb.Horizontal(
         rrb.Vertical(
             rrb.TextDocumentView(origin="verdict/words", name="verdict"),

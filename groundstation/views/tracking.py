@@ -23,9 +23,7 @@ def write_tracking(path: Path, tracked: Sequence[Tracking]) -> None:
         stream.send_blueprint(page(tracking_panel(stream, tracked)))
 
 
-def tracking_panel(
-    stream: rr.RecordingStream, tracked: Sequence[Tracking], root: str = ""
-) -> rrb.Container:
+def tracking_panel(stream: rr.RecordingStream, tracked: Sequence[Tracking], root: str = "") -> rrb.Container:
     """Flown and expected in space, the distance over time, errors per axis and the table of all."""
     count = len(tracked)
     positions = np.concatenate([t.position for t in tracked])
@@ -57,7 +55,9 @@ def tracking_panel(
     )
     errors = [
         rrb.TimeSeriesView(
-            origin=f"{root}error/{name}", name=f"error in {name}, cm", plot_legend=rrb.PlotLegend(visible=False)
+            origin=f"{root}error/{name}",
+            name=f"error in {name}, cm",
+            plot_legend=rrb.PlotLegend(visible=False),
         )
         for name in "xyz"
     ]

@@ -24,7 +24,9 @@ def write_before_after(
 ) -> None:
     """Write the recording of the first and the last model on one flight (the held-out one, where there is one), and
     the waterfall `steps` of all."""
-    with recording(path, "before and after", f"{after.flight.name}: {before.label} and {after.label}") as stream:
+    with recording(
+        path, "before and after", f"{after.flight.name}: {before.label} and {after.label}"
+    ) as stream:
         stream.send_blueprint(page(waterfall_panel(stream, before, after, steps)))
 
 

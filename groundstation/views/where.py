@@ -115,9 +115,7 @@ def _map(
     )
 
 
-def _place(
-    stream: rr.RecordingStream, place: PlaceMap, error: ErrorOverTime, root: str
-) -> rrb.Spatial3DView:
+def _place(stream: rr.RecordingStream, place: PlaceMap, error: ErrorOverTime, root: str) -> rrb.Spatial3DView:
     """The error over the ground, seen from above, the path in grey over it."""
     centres = np.column_stack([place.centres, np.zeros(len(place.centres))])
     half = np.full((len(centres), 3), [0.5 * place.cell, 0.5 * place.cell, 0.002])
