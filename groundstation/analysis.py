@@ -226,7 +226,9 @@ def provenance(*flights: tuple[str, Flight]) -> Provenance:
             versions[name] = version(name)
         except PackageNotFoundError:
             continue
-    command = shlex.join([Path(sys.argv[0]).name.removesuffix(".py"), *sys.argv[1:]])
+    program = Path(sys.argv[0]).stem
+    # run as a module, the program has the name of its file
+    command = shlex.join(["groundstation" if program == "cli" else program, *sys.argv[1:]])
     return Provenance(
         datetime.now(UTC).isoformat(timespec="seconds"), command, tuple(files.values()), versions
     )

@@ -145,7 +145,7 @@ def maps(table: Table) -> Markup:
         if names[1] != names[0]:
             _stairs(ax, edges, left[m["variable"]]["rms"], COLOURS["after"], names[1], filled=False)
         _label(ax, m)
-    axes[0].legend(loc="lower left")
+    _names(made, axes[0])
     told = ", ".join(m["variable"] for m in before)
     return to_svg(made, "maps", f"Residual RMS in m/s² over {told}; the numbers stand in the tables below.")
 
@@ -157,6 +157,12 @@ def _grid(count: int) -> tuple[Any, list[Any]]:
     for ax in flat[count:]:
         ax.set_visible(False)
     return made, flat
+
+
+def _names(made: Any, ax: Any) -> None:
+    """One legend for all panels, above them."""
+    handles, labels = ax.get_legend_handles_labels()
+    made.legend(handles, labels, loc="outside upper right", ncols=4, frameon=False, labelcolor=COLOURS["ink"])
 
 
 def _stairs(
@@ -315,7 +321,7 @@ def beside_maps(table: Table) -> Markup:
                 colour = BESIDE[k % len(BESIDE)]
                 _stairs(ax, np.array(m["edges"]), m["rms"][k], colour, row["name"], filled=False)
         _label(ax, m)
-    axes[0].legend(loc="best")
+    _names(made, axes[0])
     names = " and ".join(row["name"] for row in beside["rows"])
     return to_svg(
         made, "beside", f"Residual RMS of {names} over the same bins; the numbers stand in the tables below."

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
@@ -61,6 +63,9 @@ class Told:
         return ((key, self[key]) for key in self._raw)
 
 
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 def written(value: float | None, spec: str, scale: float = 1.0) -> str:
     """A number as people read it: `spec` of `format`, or "percent", or "change" (a signed percentage)."""
     if value is None:
@@ -70,11 +75,9 @@ def written(value: float | None, spec: str, scale: float = 1.0) -> str:
         return f"{100 * x:.0f} %" if abs(x) >= 0.01 or x == 0.0 else f"{100 * x:.1f} %"
     if spec == "change":
         return f"{100 * x:+.0f} %".replace("-", "−")
-    text = format(x, spec)
-    if "e" in text:
-        mantissa, exponent = text.split("e")
-        text = f"{mantissa}·10^{int(exponent)}"
-    return text.replace("-", "−")
+    mantissa, _, exponent = format(x, spec).partition("e")
+    power = f"·10{str(int(exponent)).translate(SUPERSCRIPT)}" if exponent else ""
+    return mantissa.replace("-", "−") + power
 
 
 def _as_html(told: Told, spec: str, scale: float = 1.0) -> Markup:
@@ -85,6 +88,17 @@ def _as_html(told: Told, spec: str, scale: float = 1.0) -> Markup:
 
 def _as_text(told: Told, spec: str, scale: float = 1.0) -> str:
     return written(told._raw, spec, scale)
+
+
+def _interval(number: Callable[..., str], parameter: Told) -> str:
+    """A parameter with its unit and interval, to two digits of the interval's width."""
+    low, high = parameter._raw["low"], parameter._raw["high"]
+    width = high - low
+    decimals = int(np.clip(1 - np.floor(np.log10(width)), 0, 6)) if 0.0 < width < np.inf else 3
+    spec = f".{decimals}f"
+    frame = "{}{} [{}, {}]"
+    parts = number(parameter.value, spec), unit(parameter.unit), number(parameter.low, spec)
+    return type(parts[0])(frame).format(*parts, number(parameter.high, spec))
 
 
 UNITS = {"m/s^2": "m/s²", "rad/s^2": "rad/s²", "m^2": "m²", "1": ""}
@@ -115,6 +129,7 @@ def environment(html: bool) -> Environment:
         lstrip_blocks=True,
     )
     made.filters["num"] = _as_html if html else _as_text
+    made.filters["interval"] = partial(_interval, made.filters["num"])
     made.filters["unit"] = unit
     made.filters["code"] = _code
     made.filters["raw"] = lambda told: told._raw

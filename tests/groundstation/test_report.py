@@ -85,7 +85,8 @@ def at(table, path):
 def read_number(shown):
     """The number that a reader sees, and by how much rounding may have moved it."""
     text = shown.replace("−", "-").replace(" %", "")
-    mantissa, _, exponent = text.partition("·10^")
+    mantissa, _, exponent = text.partition("·10")
+    exponent = exponent.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
     digits = mantissa.partition(".")[2]
     power = 10.0 ** int(exponent or 0)
     return float(mantissa) * power, 0.5 * 10.0 ** -len(digits) * power
@@ -181,9 +182,10 @@ def test_sections_stand_alone(analysis, table):
 
 
 def test_the_verdict_says_in_words_what_was_found(table):
-    first, second, *_ = sentences(table, html=False)
-    assert "linear drag in the rotor plane (rotor_drag)" in first and "54 %" in first
-    assert "0.315 to 0.213" in second
+    headline, effect, fall, held_out = sentences(table, html=False)
+    assert headline == "rotor_drag is missing from the model."
+    assert "linear drag in the rotor plane" in effect and "54 %" in effect
+    assert "0.315 to 0.213" in fall and "0.300 to 0.212" in held_out
     nothing = {**table, "effects": [e for e in table["effects"] if e["verdict"] == "included"]}
     assert (
         sentences(nothing, html=False)[0] == "Nothing is missing from the model that this flight could show."
@@ -196,12 +198,12 @@ def test_the_verdict_says_in_words_what_was_found(table):
         (0.0042, "percent", 1.0, "0.4 %"),
         (-0.25, "change", 1.0, "−25 %"),
         (0.0123, ".1f", 100.0, "1.2"),
-        (1.3e-5, ".2e", 1.0, "1.30·10^-5"),
+        (1.3e-5, ".2e", 1.0, "1.30·10⁻⁵"),
         (None, ".3f", 1.0, "–"),
     ],
 )
 def test_numbers_as_people_read_them(value, spec, scale, shown):
-    assert written(value, spec, scale).replace("·10^−", "·10^-") == shown
+    assert written(value, spec, scale) == shown
 
 
 def test_the_waterfall_ends_at_the_diagnosed_model(analysis):
@@ -243,8 +245,7 @@ def test_the_recording_tells_the_same(tmp_path, analysis, table):
     )
     for number in (
         written(table["residual_rms"]["before"], ".3f"),
-        written(table["effects"][1]["parameters"]["x"]["high"], ".3g"),
-        written(table["effects"][1]["variance_share"], "percent"),
+        written(table["effects"][1]["parameters"]["x"]["high"], ".3f"),
         f"{table['where']['worst'][0]['rms']:.2f} m/s²",
     ):
         assert number in told.stdout, number
@@ -270,7 +271,7 @@ def run(*arguments, cwd):
 
 
 def test_a_flight_without_accelerometer_position_or_attitude_has_a_report(tmp_path):
-    flight = SAMPLES / "crazyflie" / "ddsysid_crazyflie_log10_500Hz.parquet"
+    flight = SAMPLES / "crazyflie" / "crazypad_normal_E9_log03.csv"
     done = run("report", flight, "-o", tmp_path / "report.html", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     page, table = (tmp_path / "report.html").read_text(), json.loads(done.stdout)
