@@ -27,13 +27,13 @@ from groundstation.fitting import (
 from groundstation.measurement import Measurement, measure
 from groundstation.remainder import unexplained
 from groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
-from models.effect import Effect, Stage
+from models.effect import Effect, Parameter, Stage
 from models.effects import catalogue, effect_named
 from models.flight import Flight
 from models.model import Model, Term
 
-SIGNIFICANCE = 0.001
-"""Largest p-value of an effect that is called missing: a familywise 1 % over the ten or so candidates."""
+FAMILY = 0.01
+"""Probability that any effect at all is significant by chance, shared by all candidates (Bonferroni)."""
 MATERIAL_SHARE = 0.01
 """Smallest part of the remaining squared error that an effect must take away on held-out blocks."""
 MATERIAL_ACCELERATION = 0.02
@@ -95,14 +95,14 @@ class _Search:
         self.known = catalogue(base.effects_directory)
         self.candidates = [n for n in self.known if n not in base.names() and self._measurable(self.known[n])]
         self.samples = problem.measured().size
+        self.significance = FAMILY / max(1, len(self.candidates))
         self._states: dict[frozenset[str], _State] = {}
 
     def _measurable(self, effect: Effect) -> bool:
         flight = self.problem.measurements[0].flight
-        if effect.name == "accelerometer_bias" and flight.specific_force is None:
+        if effect.rotational or (effect.stage is Stage.SENSOR and not flight.accelerometer):
             return False
-        needs = [n for n in effect.needs if n != "specific_force"]
-        return bool(effect.parameters) and flight.has(*needs)
+        return bool(effect.parameters) and not effect.lacks(flight)
 
     def state(self, added: Sequence[str]) -> _State:
         """The base model with `added`, all of `added` fitted."""
@@ -177,20 +177,20 @@ class _Search:
         """Reduction of the squared error by the step, linearised at the current optimum and at its typical
         size."""
         values = {t.effect: dict(t.values) for t in current.fit.terms}
-        vehicle = self.problem.vehicle
         here = -current.fit.residual + 0.0
         chain = [(effect_named(n, self.base.effects_directory), v) for n, v in values.items()]
         base = self.problem.measured() + here
         columns = []
         for name in step:
             effect = self.known[name]
-            neutral = dict(values.get(name, effect.neutral(vehicle)))
+            neutral = dict(values.get(name, self._at_rest(effect)))
             rest = [(e, v) for e, v in chain if e.name != name]
-            for p in effect.parameters:
+            typical = effect.typical(self.problem.motions[0])
+            for p in _sizes(effect):
                 moved = {**neutral, p.name: p.typical if p.typical != neutral[p.name] else p.typical * 1.5}
                 prediction = self.problem.predict([*rest, (effect, moved)])
                 columns.append((prediction - base).ravel())
-            chain = [*rest, (effect, {p.name: p.typical for p in effect.parameters})]
+            chain = [*rest, (effect, typical)]
             base = self.problem.predict(chain) if len(step) > 1 else base
         matrix = np.column_stack([current.fit.jacobian.reshape(self.samples, -1), *columns])
         residual = current.fit.residual.ravel()
@@ -198,6 +198,12 @@ class _Search:
             matrix.T @ matrix + 1e-9 * np.eye(matrix.shape[1]), matrix.T @ residual, rcond=None
         )[0]
         return float(residual @ matrix @ solution)
+
+    def _at_rest(self, effect: Effect) -> dict[str, float]:
+        """Parameter values without effect, placed where it would act on this flight."""
+        placed = effect.typical(self.problem.motions[0])
+        neutral = effect.neutral(self.problem.vehicle)
+        return {p.name: placed[p.name] if p.structural else neutral[p.name] for p in effect.parameters}
 
     def _contribution(self, current: _State, name: str, through: str | None = None) -> np.ndarray:
         """What the effect at its typical size changes in the predicted specific force, (K A, P): one column each.
@@ -207,11 +213,11 @@ class _Search:
         values = {t.effect: dict(t.values) for t in current.fit.terms}
         effect = self.known[name]
         if through is not None:
-            values[through] = {p.name: p.typical for p in self.known[through].parameters}
+            values[through] = self.known[through].typical(self.problem.motions[0])
         rest = [(self.known[n], v) for n, v in values.items() if n != name]
-        neutral = effect.neutral(self.problem.vehicle)
+        neutral = self._at_rest(effect)
         base = self.problem.predict([*rest, (effect, neutral)])
-        moved = ({**neutral, p.name: p.typical} for p in effect.parameters)
+        moved = ({**neutral, p.name: p.typical} for p in _sizes(effect))
         return np.column_stack([(self.problem.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
 
     def _shows(self, candidate: _State, name: str) -> bool:
@@ -222,11 +228,11 @@ class _Search:
         mine = self._contribution(candidate, name).sum(axis=1)
         simpler = np.column_stack([self._contribution(candidate, n) for n in beyond])
         rest = mine - simpler @ np.linalg.lstsq(simpler, mine, rcond=None)[0]
-        return self._power(candidate, float(np.sum(rest**2)), len(self.known[name].parameters)) > SURE_TO_SEE
+        return self._power(candidate, float(np.sum(rest**2)), len(_sizes(self.known[name]))) > SURE_TO_SEE
 
     def _power(self, current: _State, energy: float, count: int) -> float:
         """Probability that `count` parameters are significant when what they change has this squared sum."""
-        threshold = stats.chi2.isf(SIGNIFICANCE, count) * (current.fit.critical / 1.96) ** 2
+        threshold = stats.chi2.isf(self.significance, count) * (current.fit.critical / 1.96) ** 2
         unit = long_run_variance(self.problem, current.fit.residual)
         return float(stats.ncx2.sf(threshold, count, energy / unit))
 
@@ -245,7 +251,7 @@ class _Search:
         return (
             gain > MATERIAL_SHARE * len(step)
             and size > MATERIAL_ACCELERATION
-            and all(candidate.fit.wald(n) < SIGNIFICANCE for n in step)
+            and all(candidate.fit.wald(n) < self.significance for n in step)
             and self._evident(candidate, current)
             and all(self._plausible(candidate.fit, n) for n in candidate.added)
         )
@@ -268,7 +274,7 @@ class _Search:
                 without = self._without(current, name)
                 useful = (
                     self._gain(current, without) > MATERIAL_SHARE
-                    and current.fit.wald(name) < SIGNIFICANCE
+                    and current.fit.wald(name) < self.significance
                     and self._evident(current, without)
                     and self._plausible(current.fit, name)
                 )
@@ -450,18 +456,23 @@ class _Search:
             mine = mine - fitted @ np.linalg.lstsq(fitted, mine, rcond=None)[0]
         energy = float(np.sum(mine**2))
         material = np.sqrt(energy / len(self.problem.measured())) > MATERIAL_ACCELERATION
-        power = self._power(current, energy, len(self.known[name].parameters))
+        power = self._power(current, energy, len(_sizes(self.known[name])))
         return bool(material and power > SURE_TO_SEE and energy > MATERIAL_SHARE * current.fit.sse)
 
     def _judge_unmeasured(self, effect: Effect) -> EffectVerdict:
         """The verdict on an effect whose measurements the flight lacks."""
         flight = self.problem.measurements[0].flight
-        missing = [n for n in effect.needs if not flight.has(n)]
+        missing = effect.lacks(flight)
         through = f" and one of {', '.join(effect.with_any)} in the model" if effect.with_any else ""
         advice = (
             f"needs {', '.join(missing) or 'measurements'}{through}; record it, and fly {effect.manoeuvre}"
         )
         return EffectVerdict(effect.name, "not_excited", None, 0.0, 1.0, (), (), advice)
+
+
+def _sizes(effect: Effect) -> list[Parameter]:
+    """The parameters that say how much of the effect there is."""
+    return [p for p in effect.parameters if not p.structural]
 
 
 def _add(effect: Effect) -> str:

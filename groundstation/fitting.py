@@ -49,7 +49,9 @@ class Free:
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the prior."""
+        """Standard deviation of the prior: two typical sizes, or half the range where no value is "no effect"."""
+        if self.parameter.structural:
+            return 0.5 * (self.parameter.high - self.parameter.low)
         return max(2.0 * abs(self.parameter.typical - self.neutral), 1e-6)
 
 
@@ -72,13 +74,14 @@ class Problem:
     def predict(self, chain: Sequence[tuple[Effect, Mapping[str, float]]]) -> np.ndarray:
         """Predicted specific force (K, A) of the used samples of all flights, behind each flight's filter."""
         parts = []
-        for m, motion in zip(self.measurements, self._motions, strict=True):
+        for m, motion in zip(self.measurements, self.motions, strict=True):
             force = m.see(specific_force(act(motion, [*chain, *self.always])))
             parts.append(force[m.used][:, m.axes])
         return np.concatenate(parts)
 
     @cached_property
-    def _motions(self) -> tuple[Motion, ...]:
+    def motions(self) -> tuple[Motion, ...]:
+        """Each flight as effects see it, before any of them acts."""
         return tuple(motion_of_flight(m.flight) for m in self.measurements)
 
     def measured(self) -> np.ndarray:
@@ -135,6 +138,10 @@ class Fit:
         """Columns of the free numbers that belong to `effect`."""
         return [i for i, f in enumerate(self.free) if f.effect == effect and not f.nuisance]
 
+    def sizes(self, effect: str) -> list[int]:
+        """Those of them that have a value of "no effect"."""
+        return [i for i in self.of(effect) if not self.free[i].parameter.structural]
+
     def interval(self, index: int) -> tuple[float, float]:
         """95 % interval of one free number."""
         half = half_width(self.free[index], self.covariance[index, index], self.critical)
@@ -145,7 +152,7 @@ class Fit:
 
         The fixed-b factor of one number is applied to the statistic as a whole.
         """
-        columns = self.of(effect)
+        columns = self.sizes(effect)
         if not columns:
             return 1.0
         neutral = np.array([self._neutral(i) for i in columns])
@@ -174,21 +181,20 @@ def critical_value(duration: float) -> float:
 
 
 def free_parameters(
-    effect: Effect, vehicle: Vehicle, start: Mapping[str, float] | None = None, period: float = 0.0
+    effect: Effect, motion: Motion, start: Mapping[str, float] | None = None, period: float = 0.0
 ) -> list[Free]:
-    """The numbers of `effect` to fit, on a clock of `period` s.
+    """The numbers of `effect` to fit to a flight, on a clock of `period` s.
 
     Bounds reach a little beyond the plausible range, so that data may contradict
     the effect instead of resting on its bound."""
     free = []
+    sizes = effect.typical(motion)
     for p in effect.parameters:
-        neutral = p.neutral_for(vehicle)
-        margin = (
-            0.0
-            if effect.stage is Stage.COMMAND or effect.name == "ground_effect"
-            else 2.0 * abs(p.typical - neutral)
-        )
-        value = (start or {}).get(p.name, neutral + 0.3 * (p.typical - neutral))
+        typical = sizes[p.name]
+        neutral = typical if p.structural else p.neutral_for(motion.vehicle)
+        within = effect.stage is Stage.COMMAND or p.even or p.structural
+        margin = 0.0 if within else 2.0 * abs(p.typical - neutral)
+        value = (start or {}).get(p.name, neutral + 0.3 * (typical - neutral))
         low, high = p.low - margin, p.high + margin
         tolerance = period if effect.name == "transport_delay" else 0.0
         value = float(np.clip(value, low + 1e-9, high - 1e-9))
@@ -215,7 +221,7 @@ def fit(
     for term in terms:
         if refit is None or term.effect in refit:
             effect = effect_named(term.effect, problem.effects_directory)
-            free += free_parameters(effect, vehicle, term.values or None, period)
+            free += free_parameters(effect, problem.motions[0], term.values or None, period)
     chain_names = list(names)
     if clock and "transport_delay" not in names:
         parameter, believed = effect_named("transport_delay").parameters[0], vehicle.command_delay

@@ -98,6 +98,10 @@ def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: f
     for flight in flights:
         for column in known.needs:
             flight.column(column)
+        if known.lacks(flight):
+            raise InputError(
+                f"{flight.origin or flight.name}: {effect} needs {', '.join(known.lacks(flight))}; record it"
+            )
     terms = (
         base.terms
         if "rigid_body" in base.names() or effect == "rigid_body"

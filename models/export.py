@@ -13,6 +13,7 @@ import onnx
 import torch
 
 from models import contract
+from models.effect import Stage
 from models.export_graph import simplify
 from models.features import feature_matrix, feature_names, features_of_flight
 from models.flight import Flight
@@ -36,7 +37,7 @@ class Correction(torch.nn.Module):
         self.chain = [
             (effect, {k: float(v) for k, v in values.items()})
             for effect, values in model.effect_chain()
-            if effect.exports and effect.name != "accelerometer_bias"
+            if effect.exports and effect.stage is not Stage.SENSOR
         ]
         self.network: torch.nn.Module | None = None
         if model.network is not None:
@@ -68,7 +69,7 @@ def sequential(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Sequ
 
 def not_exported(model: Model) -> tuple[str, ...]:
     """Effects of the model that a static correction cannot hold: those with memory, and errors of the sensor."""
-    return tuple(e.name for e, _ in model.effect_chain() if not e.exports or e.name == "accelerometer_bias")
+    return tuple(e.name for e, _ in model.effect_chain() if not e.exports or e.stage is Stage.SENSOR)
 
 
 def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] | None = None) -> bytes:
