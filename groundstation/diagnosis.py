@@ -10,7 +10,7 @@ rivals: where the exchange costs nothing, the data cannot tell them apart, and b
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -27,6 +27,7 @@ from groundstation.fitting import (
 from groundstation.measurement import Measurement, measure
 from groundstation.remainder import unexplained
 from groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
+from groundstation.rotation import RotationalFindings, judge_rotation
 from models.effect import Effect, Parameter, Stage
 from models.effects import catalogue, effect_named
 from models.flight import Flight
@@ -75,8 +76,14 @@ def diagnose(
     """
     measurement = measure(flight, bandwidth)
     held_out = None if validation is None else measure(validation, bandwidth)
+    progress("looking at the rotation")
+    rotation = judge_rotation(flight, base.names(), base.effects_directory)
     search = _Search(
-        Problem((measurement,), base.effects_directory, base.network_chain()), base, held_out, progress
+        Problem((measurement,), base.effects_directory, base.network_chain()),
+        base,
+        held_out,
+        rotation,
+        progress,
     )
     return search.run()
 
@@ -85,9 +92,15 @@ class _Search:
     """One diagnosis: fits are kept by their set of effects, for the steps visit many sets again."""
 
     def __init__(
-        self, problem: Problem, base: Model, held_out: Measurement | None, progress: Callable[[str], None]
+        self,
+        problem: Problem,
+        base: Model,
+        held_out: Measurement | None,
+        rotation: RotationalFindings,
+        progress: Callable[[str], None],
     ) -> None:
         self.problem, self.base, self.progress = problem, base, progress
+        self.rotation = rotation
         self.held_out = (
             None if held_out is None else Problem((held_out,), base.effects_directory, base.network_chain())
         )
@@ -110,7 +123,8 @@ class _Search:
         if key not in self._states:
             near = max((k for k in self._states if k <= key), key=len, default=frozenset())
             start = {t.effect: t.values for t in self._states[near].fit.terms} if near else {}
-            terms = [*self.base.terms, *(Term(n, start.get(n, {})) for n in added)]
+            # what the rotation has found acts on the thrust, too, and is not fitted to it once more
+            terms = [*self.base.terms, *self.rotation.terms, *(Term(n, start.get(n, {})) for n in added)]
             fitted = fit(self.problem, terms, refit=list(added))
             self._states[key] = _State(tuple(added), fitted, block_errors(fitted, self.blocks))
         return self._states[key]
@@ -366,7 +380,7 @@ class _Search:
                     float(np.clip(share, 0.0, 1.0)),
                     current.fit.wald(name),
                     self._estimates(current.fit, name),
-                    (*same, *effect.aliases),
+                    (*same, *effect.aliases, *self._seen_as(name, current.fit)),
                     f"to tell it from {', '.join(same)}, fly {effect.manoeuvre}" if same else _add(effect),
                 )
             )
@@ -376,8 +390,11 @@ class _Search:
         ]
         verdicts += sorted(rest, key=lambda v: (v.verdict != "possible", v.p_value))
         for name, effect in self.known.items():
-            if name not in self.candidates and name not in self.base.names():
+            if name not in self.candidates and name not in self.base.names() and not effect.rotational:
                 verdicts.append(self._judge_unmeasured(effect))
+        verdicts += [
+            replace(v, rank=None if v.rank is None else v.rank + len(found)) for v in self.rotation.verdicts
+        ]
         validation_after = self._held_out_error(current)
         held_samples = 0 if self.held_out is None else self.held_out.measured().size
         m = self.problem.measurements[0]
@@ -401,6 +418,18 @@ class _Search:
             effects=tuple(verdicts),
             unexplained=unexplained(m, current.fit.residual),
             left_out=m.left_out,
+            rotational=self.rotation.rms,
+        )
+
+    def _seen_as(self, name: str, fitted: Fit) -> tuple[str, ...]:
+        """Rotational effects that may be what `name` shows, where the flight lacks the columns to tell."""
+        flight = self.problem.measurements[0].flight
+        return tuple(
+            e.name
+            for e in self.known.values()
+            if name in e.seen_as
+            and e.lacks(flight)
+            and all(fitted.estimate[i] < 1.0 for i in fitted.of(name))
         )
 
     def _before(self, problem: Problem | None = None) -> float:

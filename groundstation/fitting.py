@@ -219,8 +219,8 @@ def fit(
     free: list[Free] = []
     period = max(m.flight.dt for m in problem.measurements)
     for term in terms:
-        if refit is None or term.effect in refit:
-            effect = effect_named(term.effect, problem.effects_directory)
+        effect = effect_named(term.effect, problem.effects_directory)
+        if (refit is None or term.effect in refit) and not effect.rotational:
             free += free_parameters(effect, problem.motions[0], term.values or None, period)
     chain_names = list(names)
     if clock and "transport_delay" not in names:

@@ -118,14 +118,15 @@ class Effect:
     """A physical effect, ready to fit, predict, diagnose, explain and export.
 
     `needs` names the columns of `models.flight.COLUMNS` it reads, `needs_any` those of which one is enough;
-    `with_any` the effects of which one must be in the model for this one to act (wind acts through drag); `exports` is False for an effect with memory, which a static
-    correction cannot hold. `beyond` names simpler effects with which this one coincides unless the flight
-    varies what it depends on (a bent thrust curve in a hover is a thrust gain). `aliases` are physical quantities
-    that no flight can tell apart from this effect. `unconfounded` is the reason why an effect has no confounder.
-    `rotational` effects are found in the angular acceleration; `seen_as` names the effects that such a one is taken
-    for where the flight lacks the columns to tell. `one_of` is True where at most one of the parameters acts (the one
-    rotor that is damaged): each is then a candidate on its own. `typical_for` gives sizes that depend on where the
-    flight went (a ceiling just above its highest point) instead of the parameters' own.
+    `with_any` the effects of which one must be in the model for this one to act (wind acts through drag); `exports`
+    is False for an effect with memory, which a static correction cannot hold. `beyond` names simpler effects with
+    which this one coincides unless the flight varies what it depends on (a bent thrust curve in a hover is a thrust
+    gain). `aliases` are physical quantities that no flight can tell apart from this effect. `unconfounded` is the
+    reason why an effect has no confounder. `rotational` effects are found in the angular acceleration; `seen_as`
+    names the effects that such a one is taken for where the flight lacks the columns to tell. `one_of` is True where
+    at most one of the parameters acts (the one rotor that is damaged): each is then a candidate on its own.
+    `typical_for` gives sizes that depend on where the flight went (a ceiling just above its highest point) instead of
+    the parameters' own.
     """
 
     name: str

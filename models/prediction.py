@@ -77,7 +77,8 @@ def rotor_thrust(flight: Flight) -> np.ndarray | None:
     """Thrust (N, 4) of each rotor in N as its speed tells, or else its motor command; None where the flight has
     neither.
 
-    What thrust a rotor speed gives is not in a vehicle file: the mean thrust of the flight is taken for the weight.
+    What thrust a rotor speed gives is not in a vehicle file: its mean over the flight is taken from the accelerometer's
+    mean, or from the weight where there is none.
     """
     vehicle = flight.vehicle
     count = len(vehicle.rotor_positions)
@@ -89,7 +90,10 @@ def rotor_thrust(flight: Flight) -> np.ndarray | None:
         return None
     flying = slice(None) if flight.flying is None else flight.flying
     mean = float(np.mean(squares[flying].sum(axis=1)))
-    return squares * (vehicle.weight / mean) if mean > 0.0 else None
+    felt = vehicle.weight
+    if flight.specific_force is not None:
+        felt = vehicle.mass * float(np.mean(flight.specific_force[flying, 2]))
+    return squares * (felt / mean) if mean > 0.0 and felt > 0.0 else None
 
 
 def motion_of_features(columns: Mapping[str, Array], vehicle: Vehicle) -> Motion:

@@ -52,7 +52,8 @@ EFFECT = Effect(
     ),
     needs=("quaternion", "position", "thrust_command"),
     manoeuvre="slow passes and hovers below the ceiling, from five rotor radii to one",
-    citation="Sanchez-Cuevas, Heredia, Ollero 2017 (ICUAS, bridge inspection by contact), thrust ratio in ceiling effect; Powers et al. 2013",
+    citation="Sanchez-Cuevas, Heredia, Ollero 2017 (ICUAS, bridge inspection by contact), thrust ratio in ceiling "
+    "effect; Powers et al. 2013",
     confounded_with=("thrust_gain", "ground_effect", "axial_inflow"),
     beyond=("thrust_gain",),
     typical_for=just_above,

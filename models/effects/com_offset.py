@@ -26,7 +26,8 @@ EFFECT = Effect(
     ),
     needs=("angular_velocity",),
     manoeuvre="any flight of half a minute, with rolls and pitches both ways and some change of thrust",
-    citation="torque r x F of rotors about the centre of mass: Mahony, Kumar, Corke 2012 (IEEE RAM 19(3)), section on dynamics",
+    citation="torque r x F of rotors about the centre of mass: "
+    "Mahony, Kumar, Corke 2012 (IEEE RAM 19(3)), section on dynamics",
     confounded_with=("rotor_damage",),
     needs_any=("rotor_speed", "motor_command"),
     exports=False,

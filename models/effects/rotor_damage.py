@@ -35,8 +35,8 @@ EFFECT = Effect(
     ),
     needs=("angular_velocity", "thrust_command"),
     manoeuvre="rolls, pitches and yaws both ways with some change of thrust: the rotors must take different loads",
-    citation="thrust c_i w_i² of each rotor with c_i its own (Mahony, Kumar, Corke 2012, section on dynamics); multiplicative loss "
-    "of effectiveness as in Freddi, Lanzon, Longhi 2011 (IFAC World Congress)",
+    citation="thrust c_i w_i² of each rotor with c_i its own (Mahony, Kumar, Corke 2012, section on dynamics); "
+    "multiplicative loss of effectiveness as in Freddi, Lanzon, Longhi 2011 (IFAC World Congress)",
     confounded_with=("com_offset", "thrust_gain"),
     needs_any=("rotor_speed", "motor_command"),
     exports=False,

@@ -24,8 +24,8 @@ EFFECT = Effect(
     ),
     needs=("quaternion", "thrust_command"),
     manoeuvre="vertical accelerations up and down, from half to one and a half times the hover thrust",
-    citation="T R e3' with e3' the rotors' axis in the body: Newton-Euler equations (Carvalho et al. 2022, eq. (1)-(3)) with "
-    "a mounting error of motors or of the autopilot",
+    citation="T R e3' with e3' the rotors' axis in the body: Newton-Euler equations "
+    "(Carvalho et al. 2022, eq. (1)-(3)) with a mounting error of motors or of the autopilot",
     confounded_with=("accelerometer_bias", "wind", "rotor_drag"),
     aliases=("mounting of the autopilot",),
     beyond=("accelerometer_bias",),

@@ -85,8 +85,8 @@ class Sensors:
         """One sample. `position` is x, y, z, quaternion and `velocity` linear (world) and angular (body), as
         in `World`.
 
-        `acceleration` (of where the accelerometer is, world, m/s²) and `rotation` (nine numbers, body to world) belong to the step that has
-        just been made, so that the specific force is the one that acted in it.
+        `acceleration` (of where the accelerometer is, world, m/s²) and `rotation` (nine numbers, body to world) belong
+        to the step that has just been made, so that the specific force is the one that acted in it.
         """
         if not self._rows:
             # Drawn in blocks: one call for a thousand samples costs less than one call for each number.
