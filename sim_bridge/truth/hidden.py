@@ -470,13 +470,13 @@ class CeilingEffect(Effect):
     """
 
     name, what = "ceiling_effect", "each rotor's thrust rises near a ceiling above the flight"
-    low, high, most, drawn, any_draws = 1.3, 2.0, 6.0, False, False
+    low, high, most, drawn, any_draws = 2.0, 3.0, 6.0, False, False
     units: ClassVar = {"radius_factor": "1", "height": "m"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """An effective radius, below a ceiling just above the survey flight's highest hover."""
         drawn = generator.uniform(self.low, self.high)
-        height = generator.uniform(2.6, 2.7)
+        height = generator.uniform(2.78, 2.85)
         return {"radius_factor": drawn if size is None else size, "height": height}
 
     def attach(
@@ -652,7 +652,7 @@ class RateLoopLag(Effect):
     """The autopilot filters the commanded body rates."""
 
     name, what = "rate_loop_lag", "body rates follow their command through a further lag"
-    low, high, most, drawn, any_draws = 0.16, 0.20, 1.0, False, False
+    low, high, most, drawn, any_draws = 0.06, 0.09, 1.0, False, True
     units: ClassVar = {"time_constant": "s"}
 
     def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
