@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy import stats
@@ -20,8 +21,10 @@ from groundstation.fitting import (
     Problem,
     block_errors,
     fit,
+    free_parameters,
     long_run_variance,
     model_of,
+    robust_covariance,
     with_clock,
 )
 from groundstation.measurement import Measurement, measure
@@ -45,6 +48,8 @@ SCREENED = 3
 """Acceptable candidates fitted in full at each step, the most promising first."""
 STRONG_EVIDENCE = 6.0
 """Twice the log likelihood ratio from which one explanation is told from another (Kass & Raftery 1995)."""
+LINEARISED = 2.0
+"""Factor that the linearised gain of an effect is trusted to, before a full fit is saved by it."""
 MOST_EFFECTS = 6
 
 
@@ -347,6 +352,8 @@ class _Search:
                 self.known[n].with_any and not {*present, rival} & set(self.known[n].with_any) for n in rest
             ):
                 continue
+            if self._cannot_stand_in(current, name, rival):
+                continue
             other = self.state((*rest, rival))
             if not self._plausible(other.fit, rival):
                 continue
@@ -354,6 +361,14 @@ class _Search:
             if equal and self._evident(other, self._without(current, name)):
                 found.append(rival)
         return tuple(found)
+
+    def _cannot_stand_in(self, current: _State, name: str, rival: str) -> bool:
+        """Whether the linearised rival takes away so little of what the effect does that no fit need be made."""
+        without = self._without(current, name)
+        lost = without.fit.sse - current.fit.sse
+        unit = long_run_variance(self.problem, current.fit.residual)
+        near = LINEARISED * self._screen(without, (rival,))
+        return near < lost and (lost - near) / unit > LINEARISED * STRONG_EVIDENCE
 
     def _evidence(self, for_: Fit, against: Fit) -> float:
         """Evidence for one fit against another with as many effects, on the scale of twice a log likelihood ratio:
@@ -410,7 +425,7 @@ class _Search:
             noise_floor=float(np.sqrt(np.mean(m.noise[axes] ** 2))),
             bandwidth=m.bandwidth,
             axes=m.axes,
-            validation_before=None if self.held_out is None else float(np.sqrt(self._before(self.held_out))),
+            validation_before=None if self.held_out is None else float(np.sqrt(self._before(held_out=True))),
             validation_after=None
             if validation_after is None
             else float(np.sqrt(validation_after / held_samples)),
@@ -432,9 +447,10 @@ class _Search:
             and all(fitted.estimate[i] < 1.0 for i in fitted.of(name))
         )
 
-    def _before(self, problem: Problem | None = None) -> float:
+    @cache  # noqa: B019 - a search lives as long as its diagnosis
+    def _before(self, held_out: bool = False) -> float:
         """Mean squared error of the base model as it stands, nothing refitted but the clock."""
-        problem = problem or self.problem
+        problem = self.held_out if held_out and self.held_out is not None else self.problem
         chain = with_clock(problem.measurements[0], self.base.chain())
         alone = [(effect, values) for effect, values in chain if effect.stage is not Stage.REMAINDER]
         return float(np.mean((problem.measured() - problem.predict(alone)) ** 2))
@@ -460,12 +476,14 @@ class _Search:
             through = next((n for n in effect.with_any if n in self.candidates), None)
             if through is None:
                 return self._judge_unmeasured(effect)
-            extended = self.state((*current.added, through, name))
+            extended = self.state((*current.added, through, name)).fit
+        elif effect.stage is Stage.COMMAND or any(p.even for p in effect.parameters):
+            extended = self.state((*current.added, name)).fit
         else:
-            extended = self.state((*current.added, name))
-        share = (current.fit.sse - extended.fit.sse) / (self._before() * self.samples)
-        p = extended.fit.wald(name)
-        estimates = self._estimates(extended.fit, name)
+            extended = self._beside(current, name)
+        share = (current.fit.sse - extended.sse) / (self._before() * self.samples)
+        p = extended.wald(name)
+        estimates = self._estimates(extended, name)
         if stands_for:
             # as a stand-in for the effect found, not beside it
             swapped = self.state(tuple(name if n == stands_for[0] else n for n in current.added))
@@ -476,6 +494,24 @@ class _Search:
             advice = f"to see it, fly {effect.manoeuvre}"
             return EffectVerdict(name, "not_excited", None, share, p, estimates, (), advice)
         return EffectVerdict(name, "not_supported", None, share, p, estimates, (), "")
+
+    def _beside(self, current: _State, name: str) -> Fit:
+        """The effect beside all that is fitted, by one Gauss-Newton step from the present optimum."""
+        effect, here = self.known[name], current.fit
+        rest = self._at_rest(effect)
+        own = [f for f in free_parameters(effect, self.problem.motions[0]) if not f.parameter.structural]
+        free = (*here.free, *own)
+        scale = np.array([f.parameter.typical - rest[f.parameter.name] for f in own])
+        columns = -self._contribution(current, name) / scale
+        jacobian = np.concatenate([here.jacobian, columns.reshape(*here.residual.shape, len(own))], axis=2)
+        start = np.concatenate([here.estimate, [rest[f.parameter.name] for f in own]])
+        weight = np.sqrt(self.problem.unit()) / np.array([f.spread for f in free])
+        flat = jacobian.reshape(self.samples, -1)
+        pull = weight**2 * (start - np.array([f.neutral for f in free]))
+        step = -np.linalg.solve(flat.T @ flat + np.diag(weight**2), flat.T @ here.residual.ravel() + pull)
+        residual = here.residual + jacobian @ step
+        covariance, critical = robust_covariance(self.problem, jacobian, residual, weight)
+        return Fit(here.terms, free, start + step, covariance, critical, jacobian, residual)
 
     def _excited(self, current: _State, name: str, through: str | None) -> bool:
         """Whether this flight would have shown the effect at its typical size, beside what is being fitted."""

@@ -240,19 +240,7 @@ def fit(
     weight = np.sqrt(problem.unit()) / np.array([f.spread for f in free])
     neutral = np.array([f.neutral for f in free])
     if free:
-        solution = optimize.least_squares(
-            lambda x: np.concatenate([residual(x), weight * (x - neutral)]),
-            np.array([f.start for f in free]),
-            jac=lambda x: np.concatenate([_jacobian(residual, x, free), np.diag(weight)]),
-            bounds=([f.low for f in free], [max(f.high, f.low + 1e-9) for f in free]),
-            x_scale=np.array([f.spread for f in free]),
-            ftol=tolerance,
-            xtol=1e-5,
-            gtol=1e-12,
-            max_nfev=25,
-        )
-        estimate, flat = solution.x, solution.fun[: measured.size]
-        jacobian = solution.jac[: measured.size]
+        estimate, flat, jacobian = _minimise(residual, free, weight, neutral, tolerance)
     else:
         estimate, flat, jacobian = np.zeros(0), residual(np.zeros(0)), np.zeros((measured.size, 0))
     k, a = measured.shape
@@ -271,11 +259,80 @@ def fit(
     return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a))
 
 
+def _minimise(
+    residual: Callable[[np.ndarray], np.ndarray],
+    free: Sequence[Free],
+    weight: np.ndarray,
+    neutral: np.ndarray,
+    tolerance: float,
+    most: int = 25,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bounded Levenberg-Marquardt (Nocedal & Wright, Numerical Optimization, 2nd ed., ch. 10): estimate, residual there
+    and Jacobian beside it.
+
+    Nearly all effects are linear in their parameters, so that two steps are enough; a step that meets a bound is taken
+    again with that number held.
+    """
+    low = np.array([f.low for f in free])
+    high = np.array([max(f.high, f.low + 1e-9) for f in free])
+    spread = np.array([f.spread for f in free])
+    x = np.clip(np.array([f.start for f in free]), low, high)
+    flat = residual(x)
+
+    def cost_of(x: np.ndarray, flat: np.ndarray) -> float:
+        return float(flat @ flat + np.sum((weight * (x - neutral)) ** 2))
+
+    cost, damping = cost_of(x, flat), 1e-8
+    jacobian = _jacobian(residual, x, free, flat)
+    for _ in range(most):
+        normal = jacobian.T @ jacobian + np.diag(weight**2)
+        slope = jacobian.T @ flat + weight**2 * (x - neutral)
+        moved = False
+        for _ in range(8):
+            step = _bounded_step(normal + damping * np.diag(np.diag(normal)), slope, x, low, high)
+            tried = residual(x + step)
+            there = cost_of(x + step, tried)
+            if there <= cost:
+                moved = True
+                break
+            damping = max(damping, 1e-6) * 30.0
+        if not moved:
+            break
+        gained = cost - there
+        x, flat, cost, damping = x + step, tried, there, damping / 10.0
+        small = gained < tolerance * cost or bool(np.all(np.abs(step) < 1e-5 * spread))
+        if small and bool(np.all(np.abs(step) < 0.05 * spread)):
+            break
+        jacobian = _jacobian(residual, x, free, flat)
+        if small:
+            break
+    return x, flat, jacobian
+
+
+def _bounded_step(
+    normal: np.ndarray, slope: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """The step to the minimum of a quadratic within bounds, by holding what runs into one."""
+    step = np.zeros_like(x)
+    loose = np.ones(len(x), dtype=bool)
+    for _ in range(len(x)):
+        inner = normal[np.ix_(loose, loose)]
+        rest = slope[loose] + normal[np.ix_(loose, ~loose)] @ step[~loose]
+        step[loose] = -np.linalg.lstsq(inner, rest, rcond=1e-14)[0]
+        over = loose & ((x + step < low) | (x + step > high))
+        if not over.any():
+            break
+        step[over] = np.clip(x + step, low, high)[over] - x[over]
+        loose &= ~over
+        if not loose.any():
+            break
+    return step
+
+
 def _jacobian(
-    residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, free: Sequence[Free]
+    residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, free: Sequence[Free], base: np.ndarray
 ) -> np.ndarray:
     """Forward differences with steps of a hundredth of each prior's width, away from the upper bound."""
-    base = residual(x)
     columns = np.empty((base.size, len(x)))
     for i, f in enumerate(free):
         step = 0.01 * f.spread

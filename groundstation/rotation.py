@@ -190,6 +190,7 @@ def torque_problem(flight: Flight) -> TorqueProblem | None:
     if np.any(inertia <= 0.0):  # not told: every axis has a gain of its own anyway
         arm = float(np.mean(np.abs(np.array(flight.vehicle.rotor_positions)[:, :2])))
         inertia = np.array([0.4, 0.4, 0.8]) * flight.vehicle.mass * max(arm, 1e-3) ** 2
+    motion = motion.with_(torque=np.zeros_like(rotation.flight.angular_velocity))
     if flight.rotor_speed is None:
         motion = _as_late_as_it_acts(motion, rotation, inertia)
     problem = TorqueProblem((rotation,), motion, inertia)

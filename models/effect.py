@@ -43,11 +43,11 @@ class Motion:
     it gives, heading frame; `force` (N, 3) all other forces over mass, body axes, m/s²; `reading` (N, 3) what the
     accelerometer adds, body axes, m/s². `rotation` (N, 3, 3) is body to heading; `air_velocity` (N, 3) the vehicle's
     velocity relative to the air, heading frame, m/s; `cos_yaw`, `sin_yaw` (N,) turn the heading frame into the world;
-    `euler` is (phi, theta), rad; `height` (N,) above ground, m; `voltage` (N,) of the battery, V.
-    `body_rate` (N, 3) in rad/s and `body_acceleration` (N, 3), its derivative, in rad/s²; `rotor_thrust` (N, 4) the
-    thrust of each rotor in N, in the order of the vehicle's rotor_positions, as its speed or its motor command tells;
-    `rotor_speed` (N, 4) in rad/s; `torque` (N, 3) on the body, N m; all in body axes. `rate_lag`, `rate_delay` in s
-    are those of the body rates behind their command. Columns that the flight lacks are None.
+    `euler` is (phi, theta), rad; `height` (N,) above ground, m; `voltage` (N,) of the battery, V. `body_rate` (N, 3)
+    in rad/s and `body_acceleration` (N, 3), its derivative, in rad/s²; `rotor_thrust` (N, 4) the thrust of each rotor
+    in N, in the order of the vehicle's rotor_positions, as its speed or its motor command tells; `rotor_speed` (N, 4)
+    in rad/s; `torque` (N, 3) on the body, N m, None where nobody asks for it; all in body axes. `rate_lag`,
+    `rate_delay` in s are those of the body rates behind their command. Columns that the flight lacks are None.
     """
 
     vehicle: Vehicle

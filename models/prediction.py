@@ -48,7 +48,7 @@ def motion_of_flight(flight: Flight) -> Motion:
         changes["body_rate"] = flight.angular_velocity
         changes["body_acceleration"] = derivative(flight.angular_velocity, flight.t)
     if (thrust := rotor_thrust(flight)) is not None:
-        changes |= {"rotor_thrust": thrust, "rotor_speed": flight.rotor_speed, "torque": zero}
+        changes |= {"rotor_thrust": thrust, "rotor_speed": flight.rotor_speed}
     return Motion(
         vehicle=flight.vehicle,
         dt=flight.dt,
@@ -142,7 +142,7 @@ def act(motion: Motion, chain: Chain) -> Motion:
         motion = effect.apply(motion, values)
     if motion.euler is not None:
         motion = motion.with_(thrust_acceleration=linear_thrust(motion))
-    if motion.rotor_thrust is not None:
+    if motion.torque is not None:
         motion = motion.with_(torque=rotor_torque(motion))
         for effect, values in at[Stage.TORQUE]:
             motion = effect.apply(motion, values)
