@@ -90,10 +90,10 @@ def rotor_thrust(flight: Flight) -> np.ndarray | None:
         return None
     flying = slice(None) if flight.flying is None else flight.flying
     mean = float(np.mean(squares[flying].sum(axis=1)))
-    felt = vehicle.weight
+    felt = 0.0
     if flight.specific_force is not None:
         felt = vehicle.mass * float(np.mean(flight.specific_force[flying, 2]))
-    return squares * (felt / mean) if mean > 0.0 and felt > 0.0 else None
+    return squares * ((felt if felt > 0.0 else vehicle.weight) / mean) if mean > 0.0 else None
 
 
 def motion_of_features(columns: Mapping[str, Array], vehicle: Vehicle) -> Motion:
