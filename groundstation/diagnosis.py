@@ -30,9 +30,10 @@ from groundstation.fitting import (
 from groundstation.measurement import Measurement, measure
 from groundstation.remainder import unexplained
 from groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
-from groundstation.rotation import RotationalFindings, judge_rotation
+from groundstation.rotation import RotationalFindings, judge_rates, judge_rotation
 from models.effect import Effect, Parameter, Stage
 from models.effects import catalogue, effect_named
+from models.errors import InputError
 from models.flight import Flight
 from models.model import Model, Term
 
@@ -50,6 +51,9 @@ STRONG_EVIDENCE = 6.0
 """Twice the log likelihood ratio from which one explanation is told from another (Kass & Raftery 1995)."""
 LINEARISED = 2.0
 """Factor that the linearised gain of an effect is trusted to, before a full fit is saved by it."""
+LONG, PART = 240.0, 20.0
+"""s of flight beyond which effects are looked for in parts of so many s, as much altogether, spread evenly; what is
+found is fitted to all of the flight and dropped where that does not support it."""
 MOST_EFFECTS = 6
 
 
@@ -79,18 +83,31 @@ def diagnose(
 
     Raises `InputError` where the flight lacks the columns for any comparison, or is too short.
     """
-    measurement = measure(flight, bandwidth)
+    whole = Problem((measure(flight, bandwidth),), base.effects_directory, base.network_chain())
     held_out = None if validation is None else measure(validation, bandwidth)
     progress("looking at the rotation")
     rotation = judge_rotation(flight, base.names(), base.effects_directory)
-    search = _Search(
-        Problem((measurement,), base.effects_directory, base.network_chain()),
-        base,
-        held_out,
-        rotation,
-        progress,
-    )
-    return search.run()
+    everything = _Search(whole, base, held_out, rotation, progress)
+    if flight.duration <= LONG:
+        return everything.report(everything.select(), everything)
+    parts = replace(whole, measurements=_spread(flight, bandwidth) or whole.measurements)
+    search = _Search(parts, base, held_out, rotation, progress)
+    found = search.select()
+    progress("fitting what was found to the whole flight")
+    kept = everything.settle(found.added)
+    return search.report(search.state(kept.added), everything)
+
+
+def _spread(flight: Flight, bandwidth: float | None) -> tuple[Measurement, ...]:
+    """Parts of `PART` s, evenly spread over a long flight; those that cannot be compared are left out."""
+    rows = round(PART / flight.dt)
+    found = []
+    for start in np.linspace(0, len(flight) - rows, round(LONG / PART)).astype(int):
+        try:
+            found.append(measure(flight.part(slice(start, start + rows)), bandwidth))
+        except InputError:
+            continue
+    return tuple(found)
 
 
 class _Search:
@@ -116,8 +133,13 @@ class _Search:
         self.significance = FAMILY / max(1, len(self.candidates))
         self._states: dict[frozenset[str], _State] = {}
 
+    @property
+    def flight(self) -> Flight:
+        """The flight, or its first part."""
+        return self.problem.measurements[0].flight
+
     def _measurable(self, effect: Effect) -> bool:
-        flight = self.problem.measurements[0].flight
+        flight = self.flight
         if effect.rotational or (effect.stage is Stage.SENSOR and not flight.accelerometer):
             return False
         return bool(effect.parameters) and not effect.lacks(flight)
@@ -136,8 +158,12 @@ class _Search:
 
     # --- the steps ------------------------------------------------------------------------------------------
 
-    def run(self) -> Diagnosis:
-        """Select, exchange, judge."""
+    def settle(self, added: Sequence[str]) -> _State:
+        """The fit of `added`, without those that this flight does not support."""
+        return self._agrees_with_held_out(self._backward(self.state(added)))
+
+    def select(self) -> _State:
+        """The effects that are missing."""
         current = self.state(())
         visited = {frozenset(current.added)}
         while len(current.added) < MOST_EFFECTS:
@@ -150,8 +176,7 @@ class _Search:
                 break
             visited.add(frozenset(following.added))
             current = following
-        current = self._agrees_with_held_out(current)
-        return self._report(current)
+        return self._agrees_with_held_out(current)
 
     def _steps(self, current: _State) -> list[tuple[str, ...]]:
         """What may be added at once: one effect, or two where the one acts only through the other."""
@@ -204,7 +229,7 @@ class _Search:
             effect = self.known[name]
             neutral = dict(values.get(name, self._at_rest(effect)))
             rest = [(e, v) for e, v in chain if e.name != name]
-            typical = effect.typical(self.problem.motions[0])
+            typical = effect.typical(self.problem.survey)
             for p in _sizes(effect):
                 moved = {**neutral, p.name: p.typical if p.typical != neutral[p.name] else p.typical * 1.5}
                 prediction = self.problem.predict([*rest, (effect, moved)])
@@ -220,7 +245,7 @@ class _Search:
 
     def _at_rest(self, effect: Effect) -> dict[str, float]:
         """Parameter values without effect, placed where it would act on this flight."""
-        placed = effect.typical(self.problem.motions[0])
+        placed = effect.typical(self.problem.survey)
         neutral = effect.neutral(self.problem.vehicle)
         return {p.name: placed[p.name] if p.structural else neutral[p.name] for p in effect.parameters}
 
@@ -232,7 +257,7 @@ class _Search:
         values = {t.effect: dict(t.values) for t in current.fit.terms}
         effect = self.known[name]
         if through is not None:
-            values[through] = self.known[through].typical(self.problem.motions[0])
+            values[through] = self.known[through].typical(self.problem.survey)
         rest = [(self.known[n], v) for n, v in values.items() if n != name]
         neutral = self._at_rest(effect)
         base = self.problem.predict([*rest, (effect, neutral)])
@@ -376,8 +401,10 @@ class _Search:
         unit = long_run_variance(self.problem, for_.residual)
         return (against.sse - for_.sse) / unit + against.surprise - for_.surprise
 
-    def _report(self, current: _State) -> Diagnosis:
-        before = self._before()
+    def report(self, current: _State, whole: _Search) -> Diagnosis:
+        """The verdicts; figures of what was found are those of the whole flight, which `whole` sees."""
+        here = whole.state(current.added)
+        before, all_before = self._before(), whole._before()
         verdicts = [EffectVerdict(n, "included", None, 0.0, 0.0, (), (), "") for n in self.base.names()]
         rivals = {n: self._rivals(current, n) for n in current.added}
         found = []
@@ -393,9 +420,9 @@ class _Search:
                     "possible" if same else "missing",
                     rank,
                     float(np.clip(share, 0.0, 1.0)),
-                    current.fit.wald(name),
-                    self._estimates(current.fit, name),
-                    (*same, *effect.aliases, *self._seen_as(name, current.fit)),
+                    here.fit.wald(name),
+                    self._estimates(here.fit, name),
+                    (*same, *effect.aliases, *self._seen_as(name, here.fit)),
                     f"to tell it from {', '.join(same)}, fly {effect.manoeuvre}" if same else _add(effect),
                 )
             )
@@ -407,38 +434,52 @@ class _Search:
         for name, effect in self.known.items():
             if name not in self.candidates and name not in self.base.names() and not effect.rotational:
                 verdicts.append(self._judge_unmeasured(effect))
-        verdicts += [
-            replace(v, rank=None if v.rank is None else v.rank + len(found)) for v in self.rotation.verdicts
-        ]
-        validation_after = self._held_out_error(current)
+        rates, rate_terms = judge_rates(
+            whole.flight, self.base.names(), self.base.effects_directory, self._later(here)
+        )
+        rank = len(found)
+        for verdict in (*self.rotation.verdicts, *rates):
+            rank += verdict.rank is not None
+            verdicts.append(replace(verdict, rank=None if verdict.rank is None else rank))
+        validation_after = whole._held_out_error(here)
         held_samples = 0 if self.held_out is None else self.held_out.measured().size
-        m = self.problem.measurements[0]
+        m = whole.problem.measurements[0]
         axes = list(m.axes)
-        shift = [float(current.fit.estimate[i]) for i, f in enumerate(current.fit.free) if f.nuisance]
-        final = model_of(current.fit, self.base)
+        shift = [float(here.fit.estimate[i]) for i, f in enumerate(here.fit.free) if f.nuisance]
+        final = model_of(here.fit, self.base)
+        final = final.with_terms((*final.terms, *rate_terms))
         return Diagnosis(
             flight=m.flight,
             base=self.base,
             model=final,
-            rms_before=float(np.sqrt(before)),
-            rms_after=float(np.sqrt(current.fit.sse / self.samples)),
+            rms_before=float(np.sqrt(all_before)),
+            rms_after=float(np.sqrt(here.fit.sse / whole.samples)),
             noise_floor=float(np.sqrt(np.mean(m.noise[axes] ** 2))),
             bandwidth=m.bandwidth,
             axes=m.axes,
-            validation_before=None if self.held_out is None else float(np.sqrt(self._before(held_out=True))),
+            validation_before=None if self.held_out is None else float(np.sqrt(whole._before(held_out=True))),
             validation_after=None
             if validation_after is None
             else float(np.sqrt(validation_after / held_samples)),
             clock_shift=shift[0] - self.problem.vehicle.command_delay if shift else None,
             effects=tuple(verdicts),
-            unexplained=unexplained(m, current.fit.residual),
+            unexplained=unexplained(m, here.fit.residual),
             left_out=m.left_out,
             rotational=self.rotation.rms,
         )
 
+    def _later(self, current: _State) -> float:
+        """s by which rotors were found to follow their command later than believed: the rate loop is built on them."""
+        vehicle, later = self.problem.vehicle, 0.0
+        for term in current.fit.terms:
+            if term.effect in current.added and self.known[term.effect].stage is Stage.COMMAND:
+                for p in self.known[term.effect].parameters:
+                    later += max(0.0, float(term.values[p.name]) - p.neutral_for(vehicle))
+        return later
+
     def _seen_as(self, name: str, fitted: Fit) -> tuple[str, ...]:
         """Rotational effects that may be what `name` shows, where the flight lacks the columns to tell."""
-        flight = self.problem.measurements[0].flight
+        flight = self.flight
         return tuple(
             e.name
             for e in self.known.values()
@@ -499,7 +540,7 @@ class _Search:
         """The effect beside all that is fitted, by one Gauss-Newton step from the present optimum."""
         effect, here = self.known[name], current.fit
         rest = self._at_rest(effect)
-        own = [f for f in free_parameters(effect, self.problem.motions[0]) if not f.parameter.structural]
+        own = [f for f in free_parameters(effect, self.problem.survey) if not f.parameter.structural]
         free = (*here.free, *own)
         scale = np.array([f.parameter.typical - rest[f.parameter.name] for f in own])
         columns = -self._contribution(current, name) / scale
@@ -526,8 +567,7 @@ class _Search:
 
     def _judge_unmeasured(self, effect: Effect) -> EffectVerdict:
         """The verdict on an effect whose measurements the flight lacks."""
-        flight = self.problem.measurements[0].flight
-        missing = effect.lacks(flight)
+        missing = effect.lacks(self.flight)
         through = f" and one of {', '.join(effect.with_any)} in the model" if effect.with_any else ""
         advice = (
             f"needs {', '.join(missing) or 'measurements'}{through}; record it, and fly {effect.manoeuvre}"

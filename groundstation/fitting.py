@@ -84,6 +84,12 @@ class Problem:
         """Each flight as effects see it, before any of them acts."""
         return tuple(motion_of_flight(m.flight) for m in self.measurements)
 
+    @cached_property
+    def survey(self) -> Motion:
+        """What tells where the flights went: the motion that reached highest."""
+        heights = [-np.inf if m.height is None else float(np.max(m.height)) for m in self.motions]
+        return self.motions[int(np.argmax(heights))]
+
     def measured(self) -> np.ndarray:
         """Measured specific force (K, A) of the used samples."""
         return np.concatenate([m.value[m.used][:, m.axes] for m in self.measurements])
@@ -221,7 +227,7 @@ def fit(
     for term in terms:
         effect = effect_named(term.effect, problem.effects_directory)
         if (refit is None or term.effect in refit) and not effect.rotational:
-            free += free_parameters(effect, problem.motions[0], term.values or None, period)
+            free += free_parameters(effect, problem.survey, term.values or None, period)
     chain_names = list(names)
     if clock and "transport_delay" not in names:
         parameter, believed = effect_named("transport_delay").parameters[0], vehicle.command_delay

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import ndimage, signal
@@ -104,11 +105,28 @@ def measure_rotation(flight: Flight) -> Rotation | None:
 
 
 def _low_pass(x: np.ndarray, sos: np.ndarray, pieces: list[slice], fs: float) -> np.ndarray:
-    """Zero-phase low-pass of columns (N, k) that reaches across no gap."""
+    """Zero-phase low-pass of columns (N, k) that reaches across no gap.
+
+    As `scipy.signal.sosfiltfilt`, which works out the filter's steady state anew at every call.
+    """
     out = np.empty_like(x)
+    steady = _steady_state(sos.tobytes())
     for piece in pieces:
-        out[piece] = signal.sosfiltfilt(sos, x[piece], axis=0, padlen=min(len(x[piece]) - 1, int(fs)))
+        part = x[piece]
+        pad = min(len(part) - 1, int(fs))
+        extended = np.concatenate(
+            [2.0 * part[:1] - part[pad:0:-1], part, 2.0 * part[-1:] - part[-2 : -pad - 2 : -1]]
+        )
+        forward, _ = signal.sosfilt(sos, extended, axis=0, zi=steady[:, :, None] * extended[0])
+        backward, _ = signal.sosfilt(sos, forward[::-1], axis=0, zi=steady[:, :, None] * forward[-1])
+        out[piece] = backward[::-1][pad : pad + len(part)]
     return out
+
+
+@cache
+def _steady_state(sos: bytes) -> np.ndarray:
+    """State of the filter under a constant one, (sections, 2)."""
+    return signal.sosfilt_zi(np.frombuffer(sos).reshape(-1, 6))
 
 
 def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -> Measurement:

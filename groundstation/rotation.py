@@ -54,6 +54,9 @@ still make good (`models.contract.ACTUATION_LIMITS`). Beyond, no attitude loop i
 RATE_TOLERANCE = 1.5
 """Factor on the vehicle file's rate_time_constant, which is known from a step or a design, not from a fit."""
 
+LOOP_PER_ROTOR = 2.0
+"""s by which a rate loop with 60 degrees of phase margin slows down for every s that its rotors are later."""
+
 Choice = tuple[str, tuple[str, ...]]
 """An effect and those of its parameters that act."""
 
@@ -70,7 +73,7 @@ class RotationalFindings:
 def judge_rotation(
     flight: Flight, included: Sequence[str] = (), effects_directory: str | None = None
 ) -> RotationalFindings:
-    """Verdicts on all rotational effects of the catalogue; `included` are in the model already."""
+    """Verdicts on all effects on the torque; `included` are in the model already."""
     known = {n: e for n, e in catalogue(effects_directory).items() if e.rotational and n not in included}
     verdicts: list[EffectVerdict] = []
     terms: list[Term] = []
@@ -84,12 +87,21 @@ def judge_rotation(
         terms += search.terms()
         rms = search.rms()
     verdicts += [_unmeasured(e, flight) for n, e in torque.items() if problem is None or n not in measurable]
-    for effect in known.values():
-        if effect.stage is Stage.RATE:
-            verdict, term = _judge_rates(effect, flight)
+    return RotationalFindings(tuple(verdicts), tuple(terms), rms)
+
+
+def judge_rates(
+    flight: Flight, included: Sequence[str] = (), effects_directory: str | None = None, later: float = 0.0
+) -> tuple[list[EffectVerdict], list[Term]]:
+    """Verdicts on how body rates follow their command, and the terms found; `later` s is by how much more than
+    believed the rotors were found to lag theirs."""
+    verdicts, terms = [], []
+    for name, effect in catalogue(effects_directory).items():
+        if effect.stage is Stage.RATE and name not in included:
+            verdict, term = _judge_rates(effect, flight, later)
             verdicts.append(verdict)
             terms += [] if term is None else [term]
-    return RotationalFindings(tuple(verdicts), tuple(terms), rms)
+    return verdicts, terms
 
 
 def fit_rotation(flight: Flight, effect: Effect) -> Term | None:
@@ -285,7 +297,8 @@ class _Search:
                     jacobian[:, axis, axis] += value * c[:, axis]
             predicted = linear @ x[:fixed] + sum(v * c for v, c in zip(x[fixed:], scaled, strict=True))
             residual = measured - predicted
-            step = np.linalg.lstsq(jacobian.reshape(3 * k, -1), residual.ravel(), rcond=1e-10)[0]
+            flat = jacobian.reshape(3 * k, -1)
+            step = np.linalg.lstsq(flat.T @ flat, flat.T @ residual.ravel(), rcond=1e-14)[0]
             x = x + step
             if np.max(np.abs(step) / (np.abs(x) + 1e-6)) < 1e-6:
                 break
@@ -367,12 +380,10 @@ class _Search:
 
     def rms(self) -> RotationalRms:
         """Residual of the rotors' torque alone, and of what was found, rad/s² over all axes."""
-        before, after = (self.fit(c).residual / self.weight for c in ((), self.found))
-        noise = self.problem.rotation.noise
         r = self.problem.rotation
-        return RotationalRms(
-            *(float(np.sqrt(np.mean(x**2))) for x in (before, after, noise)), bandwidth=r.bandwidth
-        )
+        residuals = (self.fit(c).residual / self.weight for c in ((), self.found))
+        before, after, noise = (float(np.sqrt(np.mean(x**2))) for x in (*residuals, r.noise))
+        return RotationalRms(before, after, noise, r.bandwidth)
 
     def _verdicts(self) -> list[EffectVerdict]:
         before = self.fit(()).sse
@@ -443,11 +454,12 @@ class _Search:
     def _excited(self, here: Fit, choice: Choice) -> bool:
         """Whether this flight would have shown the effect at its typical size, beside what is being fitted."""
         name, names = choice
-        mine = sum(
-            p.typical * self._columns[name, p.name] * self.weight
-            for p in self.effects[name].parameters
-            if p.name in names
-        ).ravel()
+        acting = [p for p in self.effects[name].parameters if p.name in names]
+        mine = (
+            np.stack([p.typical * self._columns[name, p.name] * self.weight for p in acting])
+            .sum(axis=0)
+            .ravel()
+        )
         fitted = here.jacobian.reshape(len(mine), -1)
         rest = mine - fitted @ np.linalg.lstsq(fitted, mine, rcond=1e-10)[0]
         energy = float(rest @ rest)
@@ -484,7 +496,7 @@ def _unmeasured(effect: Effect, flight: Flight) -> EffectVerdict:
 # --- rates ----------------------------------------------------------------------------------------------------
 
 
-def _judge_rates(effect: Effect, flight: Flight) -> tuple[EffectVerdict, Term | None]:
+def _judge_rates(effect: Effect, flight: Flight, later: float) -> tuple[EffectVerdict, Term | None]:
     """The closed rate loop against what is believed of it."""
     if effect.lacks(flight):
         return _unmeasured(effect, flight), None
@@ -501,11 +513,10 @@ def _judge_rates(effect: Effect, flight: Flight) -> tuple[EffectVerdict, Term | 
     intervals = {n: (max(0.0, v - h), v + h) for (n, v), h in zip(values.items(), half, strict=True)}
     estimates = tuple(ParameterEstimate(n, v, *intervals[n], unit[n]) for n, v in values.items())
     believed = flight.vehicle.rate_time_constant
-    granted = (
-        max(UNBELIEVED_LAG, RATE_TOLERANCE * (believed + flight.vehicle.command_delay))
-        if believed == 0.0
-        else RATE_TOLERANCE * (believed + flight.vehicle.command_delay) + period
-    )
+    granted = RATE_TOLERANCE * (believed + flight.vehicle.command_delay) + period
+    if believed == 0.0:
+        granted = max(UNBELIEVED_LAG, granted)
+    granted += LOOP_PER_ROTOR * later
     total = loop.lag + loop.delay
     spread = critical * float(np.sqrt(max(covariance[:2, :2].sum(), 0.0)))
     z = (total - granted) / max(spread / 1.96, 1e-6)
