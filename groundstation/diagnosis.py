@@ -31,6 +31,7 @@ from groundstation.measurement import Measurement, measure
 from groundstation.remainder import unexplained
 from groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
 from groundstation.rotation import RotationalFindings, judge_rates, judge_rotation
+from groundstation.rotors import BESIDE, PATH, RotorProblem, has_rotor_speeds
 from models.effect import Effect, Parameter, Stage
 from models.effects import catalogue, effect_named
 from models.errors import InputError
@@ -88,14 +89,35 @@ def diagnose(
     progress("looking at the rotation")
     rotation = judge_rotation(flight, base.names(), base.effects_directory)
     everything = _Search(whole, base, held_out, rotation, progress)
-    if flight.duration <= LONG:
-        return everything.report(everything.select(), everything)
-    parts = replace(whole, measurements=_spread(flight, bandwidth) or whole.measurements)
-    search = _Search(parts, base, held_out, rotation, progress)
+    search = everything
+    if flight.duration > LONG:
+        parts = replace(whole, measurements=_spread(flight, bandwidth) or whole.measurements)
+        search = _Search(parts, base, held_out, rotation, progress)
+    if has_rotor_speeds(flight):
+        progress("looking between command and rotors")
+        search.on_the_way = _on_the_way(search, base, rotation)
     found = search.select()
+    if search is everything:
+        return search.report(found, everything)
     progress("fitting what was found to the whole flight")
     kept = everything.settle(found.added)
     return search.report(search.state(kept.added), everything)
+
+
+def _on_the_way(search: _Search, base: Model, rotation: RotationalFindings) -> tuple[str, ...]:
+    """The effects that rotor speeds show between command and rotor.
+
+    None where they leave more of the rotors' thrust unexplained than the accelerometer's noise: there the rotors did
+    not follow the collective (a saturated mixer), and prove nothing.
+    """
+    problem = RotorProblem(search.problem.measurements, base.effects_directory)
+    path = _Search(problem, base, None, replace(rotation, terms=()), lambda _: None)
+    path.candidates = [n for n in PATH if n in path.candidates]
+    path.beside = tuple(n for n in BESIDE if n not in base.names())
+    found = path.select()
+    left = np.sqrt(found.fit.sse / path.samples)
+    floor = min(float(m.noise[2]) for m in problem.measurements)
+    return found.added if left < floor else ()
 
 
 def _spread(flight: Flight, bandwidth: float | None) -> tuple[Measurement, ...]:
@@ -131,6 +153,10 @@ class _Search:
         self.candidates = [n for n in self.known if n not in base.names() and self._measurable(self.known[n])]
         self.samples = problem.measured().size
         self.significance = FAMILY / max(1, len(self.candidates))
+        self.on_the_way: tuple[str, ...] = ()
+        """Effects that rotor speeds have shown to act before the rotors."""
+        self.beside: tuple[str, ...] = ()
+        """Effects fitted in every state without being judged."""
         self._states: dict[frozenset[str], _State] = {}
 
     @property
@@ -151,8 +177,9 @@ class _Search:
             near = max((k for k in self._states if k <= key), key=len, default=frozenset())
             start = {t.effect: t.values for t in self._states[near].fit.terms} if near else {}
             # what the rotation has found acts on the thrust, too, and is not fitted to it once more
-            terms = [*self.base.terms, *self.rotation.terms, *(Term(n, start.get(n, {})) for n in added)]
-            fitted = fit(self.problem, terms, refit=list(added))
+            free = (*self.beside, *added)
+            terms = [*self.base.terms, *self.rotation.terms, *(Term(n, start.get(n, {})) for n in free)]
+            fitted = fit(self.problem, terms, refit=free)
             self._states[key] = _State(tuple(added), fitted, block_errors(fitted, self.blocks))
         return self._states[key]
 
@@ -164,7 +191,7 @@ class _Search:
 
     def select(self) -> _State:
         """The effects that are missing."""
-        current = self.state(())
+        current = self._backward(self.state(self.on_the_way))
         visited = {frozenset(current.added)}
         while len(current.added) < MOST_EFFECTS:
             self.progress(f"{len(current.added)} effects found, looking for the next")
@@ -368,7 +395,9 @@ class _Search:
         """Effects that could stand in for `name` at no cost."""
         rest = [n for n in current.added if n != name]
         present = {*self.base.names(), *rest}
-        found = []
+        found: list[str] = []
+        if name in self.on_the_way:
+            return ()  # the rotors themselves show it
         for rival in self.candidates:
             needed = self.known[rival].with_any
             if rival in current.added or (needed and not present & set(needed)):
