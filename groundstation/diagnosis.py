@@ -104,7 +104,7 @@ def diagnose(
     return search.report(search.state(kept.added), everything)
 
 
-def _on_the_way(search: _Search, base: Model, rotation: RotationalFindings) -> tuple[str, ...]:
+def _on_the_way(search: _Search, base: Model, rotation: RotationalFindings) -> tuple[Term, ...]:
     """The effects that rotor speeds show between command and rotor.
 
     None where they leave more of the rotors' thrust unexplained than the accelerometer's noise: there the rotors did
@@ -117,7 +117,7 @@ def _on_the_way(search: _Search, base: Model, rotation: RotationalFindings) -> t
     found = path.select()
     left = np.sqrt(found.fit.sse / path.samples)
     floor = min(float(m.noise[2]) for m in problem.measurements)
-    return found.added if left < floor else ()
+    return tuple(t for t in found.fit.terms if t.effect in found.added) if left < floor else ()
 
 
 def _spread(flight: Flight, bandwidth: float | None) -> tuple[Measurement, ...]:
@@ -153,7 +153,7 @@ class _Search:
         self.candidates = [n for n in self.known if n not in base.names() and self._measurable(self.known[n])]
         self.samples = problem.measured().size
         self.significance = FAMILY / max(1, len(self.candidates))
-        self.on_the_way: tuple[str, ...] = ()
+        self.on_the_way: tuple[Term, ...] = ()
         """Effects that rotor speeds have shown to act before the rotors."""
         self.beside: tuple[str, ...] = ()
         """Effects fitted in every state without being judged."""
@@ -191,7 +191,7 @@ class _Search:
 
     def select(self) -> _State:
         """The effects that are missing."""
-        current = self._backward(self.state(self.on_the_way))
+        current = self._backward(self.state([t.effect for t in self.on_the_way]))
         visited = {frozenset(current.added)}
         while len(current.added) < MOST_EFFECTS:
             self.progress(f"{len(current.added)} effects found, looking for the next")
@@ -396,7 +396,7 @@ class _Search:
         rest = [n for n in current.added if n != name]
         present = {*self.base.names(), *rest}
         found: list[str] = []
-        if name in self.on_the_way:
+        if name in {t.effect for t in self.on_the_way}:
             return ()  # the rotors themselves show it
         for rival in self.candidates:
             needed = self.known[rival].with_any
@@ -467,6 +467,9 @@ class _Search:
             whole.flight, self.base.names(), self.base.effects_directory, self._later(here)
         )
         rank = len(found)
+        unseen = tuple(v.name for v in rest if v.verdict == "not_excited" and self._in_command(v.name))
+        if unseen:
+            rates = [_possible(v, unseen) if v.verdict == "missing" else v for v in rates]
         for verdict in (*self.rotation.verdicts, *rates):
             rank += verdict.rank is not None
             verdicts.append(replace(verdict, rank=None if verdict.rank is None else rank))
@@ -497,14 +500,20 @@ class _Search:
             rotational=self.rotation.rms,
         )
 
+    def _in_command(self, name: str) -> bool:
+        return self.known[name].stage is Stage.COMMAND
+
     def _later(self, current: _State) -> float:
         """s by which rotors were found to follow their command later than believed: the rate loop is built on them."""
-        vehicle, later = self.problem.vehicle, 0.0
-        for term in current.fit.terms:
-            if term.effect in current.added and self.known[term.effect].stage is Stage.COMMAND:
-                for p in self.known[term.effect].parameters:
-                    later += max(0.0, float(term.values[p.name]) - p.neutral_for(vehicle))
-        return later
+        vehicle = self.problem.vehicle
+        found = {t.effect: t for t in current.fit.terms if t.effect in current.added}
+        found |= {t.effect: t for t in self.on_the_way}
+        return sum(
+            max(0.0, float(term.values[p.name]) - p.neutral_for(vehicle))
+            for name, term in found.items()
+            for p in self.known[name].parameters
+            if self._in_command(name)
+        )
 
     def _seen_as(self, name: str, fitted: Fit) -> tuple[str, ...]:
         """Rotational effects that may be what `name` shows, where the flight lacks the columns to tell."""
@@ -602,6 +611,12 @@ class _Search:
             f"needs {', '.join(missing) or 'measurements'}{through}; record it, and fly {effect.manoeuvre}"
         )
         return EffectVerdict(effect.name, "not_excited", None, 0.0, 1.0, (), (), advice)
+
+
+def _possible(verdict: EffectVerdict, rivals: tuple[str, ...]) -> EffectVerdict:
+    """The verdict where effects that this flight could not show would look the same."""
+    advice = f"{verdict.advice}; to tell it from {', '.join(rivals)}, fly quick vertical steps as well"
+    return replace(verdict, verdict="possible", indistinguishable_from=rivals, advice=advice)
 
 
 def _sizes(effect: Effect) -> list[Parameter]:

@@ -99,6 +99,7 @@ def thrust_from_rotors(flight: Flight) -> Flight:
     return replace(
         flight,
         thrust_command=command,
-        vehicle=replace(vehicle, command_delay=0.0, motor_time_constant=0.0),
+        # of the rate loop, which lies before the rotors, nothing is believed then
+        vehicle=replace(vehicle, command_delay=0.0, motor_time_constant=0.0, rate_time_constant=0.0),
         notes=(*flight.notes, "thrust is that of the rotor speeds"),
     )
