@@ -65,7 +65,7 @@ class Companion:
         except InputError:
             session.close()
             raise
-        self.flight = Flight(law, settings.safety, self.emit)
+        self.flight = Flight(law, settings.safety, self.emit, settings.trim)
         self.director = Director(
             self.link,
             self.flight,

@@ -55,24 +55,37 @@ class LinearBehaviour:
         self, states: _States, before: ReferenceSample, after: ReferenceSample, share: float
     ) -> tuple[float, ...]:
         px, py, pz, vx, vy, vz, roll, pitch, yaw = states
-        (rx, ry, rz), (ux, uy, uz), (ax, ay, az) = (
-            [p + share * (q - p) for p, q in zip(one, other, strict=True)]
-            for one, other in zip(before[:3], after[:3], strict=True)
-        )
+        rx, ry, rz = _between(before.position, after.position, share)
+        ux, uy, uz = _between(before.velocity, after.velocity, share)
+        ax, ay, az = _between(before.acceleration, after.acceleration, share)
         turn = (after.yaw - before.yaw + math.pi) % (2.0 * math.pi) - math.pi
         wanted_yaw = before.yaw + share * turn
         c, s = math.cos(yaw), math.sin(yaw)
         ex, ey, dx, dy = px - rx, py - ry, vx - ux, vy - uy
         e = (c * ex + s * ey, c * ey - s * ex, pz - rz, c * dx + s * dy, c * dy - s * dx, vz - uz)
-        a, b, d = self._k_eta
-        wanted_roll = -sum(k * x for k, x in zip(a, e, strict=True)) - (c * ay - s * ax) / GRAVITY
-        wanted_pitch = -sum(k * x for k, x in zip(b, e, strict=True)) + (c * ax + s * ay) / GRAVITY
-        lift = -sum(k * x for k, x in zip(d, e, strict=True)) / self._mass + az
-        z = (
-            roll - wanted_roll,
-            pitch - wanted_pitch,
-            (yaw - wanted_yaw + math.pi) % (2.0 * math.pi) - math.pi,
+        k_roll, k_pitch, k_lift = self._k_eta
+        wanted_roll = -_product(k_roll, e) - (c * ay - s * ax) / GRAVITY
+        wanted_pitch = -_product(k_pitch, e) + (c * ax + s * ay) / GRAVITY
+        lift = -_product(k_lift, e) / self._mass + az
+        zx, zy = roll - wanted_roll, pitch - wanted_pitch
+        zz = (yaw - wanted_yaw + math.pi) % (2.0 * math.pi) - math.pi
+        a, b, d = self._k_zeta
+        rates = (
+            -(a[0] * zx + a[1] * zy + a[2] * zz),
+            -(b[0] * zx + b[1] * zy + b[2] * zz),
+            -(d[0] * zx + d[1] * zy + d[2] * zz),
         )
-        rates = [-sum(k * x for k, x in zip(row, z, strict=True)) for row in self._k_zeta]
         fx, fy = GRAVITY * pitch, -GRAVITY * roll
         return (vx, vy, vz, c * fx - s * fy, s * fx + c * fy, lift, *rates)
+
+
+def _between(one: Vector, other: Vector, share: float) -> Vector:
+    return (
+        one[0] + share * (other[0] - one[0]),
+        one[1] + share * (other[1] - one[1]),
+        one[2] + share * (other[2] - one[2]),
+    )
+
+
+def _product(k: tuple[float, ...], e: tuple[float, ...]) -> float:
+    return k[0] * e[0] + k[1] * e[1] + k[2] * e[2] + k[3] * e[3] + k[4] * e[4] + k[5] * e[5]

@@ -9,14 +9,15 @@ it is known. Thrust acts after the motors' delay and lag, tilt in addition only 
 cascade is evaluated for the moment at which its command will act, the rate loop's lag is inverted, and the
 attitude asked for the correction c is led by the attitude loop itself: `zeta_ref = u* + c + c_dot / K_zeta` makes
 `zeta - c` follow `u*` as the linear design does. The model is asked at the attitude that the vehicle will have,
-which is what it was fitted to, not at the one asked for; that also leaves no equation to be solved for u.
+which is what it was fitted to, not at the one asked for; that also leaves no equation to be solved for u. Of the
+height it is told the expected one: see `Corrected._ahead`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from companion.actuation import Actuation, LagInverse, RateModel
@@ -32,12 +33,10 @@ from companion.control import (
     features,
 )
 from companion.guard import Correction
+from models.contract import CONTROLLERS, CORRECTED, LQR, LQR_INTEGRAL
 from models.errors import InputError
 from models.trajectory import ReferenceSample
 from models.vehicle import GRAVITY
-
-LQR, LQR_INTEGRAL, CORRECTED = "lqr", "lqr_integral", "corrected"
-CONTROLLERS = (LQR, LQR_INTEGRAL, CORRECTED)
 
 Preview = Callable[[float], ReferenceSample]
 """The reference so many seconds from now; it holds still after its end."""
@@ -68,8 +67,11 @@ class Corrector(Protocol):
         """What is known of the path from command to motion."""
         ...
 
-    def step(self, rows: Sequence[list[float]], ahead: float, dt: float) -> Correction:
-        """The correction for three rows of features: when tilt acts, `ahead` s later, and when thrust acts."""
+    def step(self, rows: Sequence[list[float]], ahead: float, dt: float, height: float) -> Correction:
+        """The correction for three rows of features: when tilt acts, `ahead` s later, and when thrust acts.
+
+        `height` above the ground, m, is the measured one.
+        """
         ...
 
 
@@ -81,11 +83,11 @@ class Controller(Protocol):
         ...
 
     def start(self) -> None:
-        """The mission's trajectory begins with the next tick."""
+        """The correction, or the mission's trajectory, begins with the next tick."""
         ...
 
     def stop(self) -> None:
-        """The mission's trajectory is over."""
+        """The correction is over."""
         ...
 
 
@@ -93,12 +95,13 @@ class Controller(Protocol):
 class TrimLimits:
     """The slow trim of `corrected`: it removes what is left between the flight and its linear behaviour.
 
-    The integral of the distance to the expected linear behaviour, with `bandwidth` (rad/s, in relation to the
-    position loop's stiffness) and an `authority` in m/s² per axis; `bandwidth` 0 switches it off.
+    The integral of the distance to the expected linear behaviour: `bandwidth` in rad/s is its gain over the
+    position loop's stiffness, a fifth of that loop's natural frequency, so that it takes little of its phase;
+    `authority` in m/s² per axis. `bandwidth` 0 switches it off.
     """
 
-    bandwidth: float = 0.25
-    authority: float = 1.0
+    bandwidth: float = field(default=0.4, metadata={"zero": "switches it off"})
+    authority: float = 2.0
 
 
 def make_controller(
@@ -200,11 +203,12 @@ class Corrected:
         self._behaviour: LinearBehaviour | None = None
         self._trim = ZERO  # m/s², world
         self._share = 0.0
+        self._at_limit = False
         self._command = ZERO
         self._rates, self._inverse = RateModel(corrector.actuation), LagInverse()
 
     def start(self) -> None:
-        """Expect the linear behaviour from the next tick's state on."""
+        """Expect the linear behaviour from the next tick's state on; what the trim has learned stays."""
         self._running, self._behaviour = True, None
 
     def stop(self) -> None:
@@ -238,9 +242,9 @@ class Corrected:
         ahead = max(known.rate_lag, _AHEAD)
         lift = known.thrust_delay + known.thrust_lag
         acceleration = _acceleration(state)
-        early = _after(state, acceleration, known.rate_delay)
-        late = _after(state, acceleration, known.rate_delay + ahead)
-        lifted = _after(state, acceleration, lift)
+        early = self._ahead(state, acceleration, known.rate_delay)
+        late = self._ahead(state, acceleration, known.rate_delay + ahead)
+        lifted = self._ahead(state, acceleration, lift)
         reference = preview(known.rate_delay)
         tilt = law.feedback(early, yaw, reference)
         tilt_late = law.feedback(late, yaw, preview(known.rate_delay + ahead))
@@ -266,7 +270,7 @@ class Corrected:
                 corrector.wants_yaw,
             ),
         ]
-        correction = corrector.step(rows, ahead, dt)
+        correction = corrector.step(rows, ahead, dt, state.height)
         x, y, z = (a + t for a, t in zip(correction.applied, trim, strict=True))
         # The attitude loop takes 1 / K to follow: lead the correction by that much.
         led = (
@@ -279,6 +283,7 @@ class Corrected:
             Attitude(tilt_late.roll, tilt_late.pitch, lifted_thrust),
             (led[0] + ahead * correction.rate[0], led[1] + ahead * correction.rate[1], 0.0),
         )
+        self._at_limit = law.at_limit(attitude)
         wanted = law.euler_rates(tilted, attitude, reference.yaw)
         then = law.euler_rates(
             (tilted[0] + ahead * rates[0], tilted[1] + ahead * rates[1], yaw), later, reference.yaw
@@ -288,6 +293,19 @@ class Corrected:
         command = law.turning(zeta, (wanted[0] + added[0], wanted[1] + added[1], wanted[2]), attitude.thrust)
         self._command = command.body_rate
         return ControlStep(plain, (x, y, z), correction.raw, command, law.normalised(command.thrust), trim)
+
+    def _ahead(self, state: State, acceleration: Vector, h: float) -> State:
+        """The state `h` s later; its height is that of the linear behaviour, where one is expected.
+
+        Ground effect holds a vehicle up; a correction of the measured height's ground effect takes that away, and a
+        little too much of it lets the vehicle sink. At the expected height the correction is the same along the
+        way, and what the ground does to a deviation is left to help.
+        """
+        later = _after(state, acceleration, h)
+        if self._behaviour is None:
+            return later
+        deviation = state.position[2] - self._behaviour.position[2]
+        return later._replace(height=state.height - deviation + h * self._behaviour.velocity[2])
 
     def _faded(self, engaged: float, dt: float) -> float:
         """The share of look-ahead and trim: follows what is engaged, at the pace of a fade at most."""
@@ -306,7 +324,10 @@ class Corrected:
                 )
             else:
                 self._behaviour.step(reference, dt)
-                self._grow(state.position, self._behaviour.position, zeta[2], share * min(_LONGEST_STEP, dt))
+                if not self._at_limit:  # what is missing there is not the correction
+                    self._grow(
+                        state.position, self._behaviour.position, zeta[2], share * min(_LONGEST_STEP, dt)
+                    )
         c, s = math.cos(zeta[2]), math.sin(zeta[2])
         x, y, z = (share * t for t in self._trim)
         return c * x + s * y, c * y - s * x, z

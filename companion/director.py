@@ -40,6 +40,7 @@ _STALLED, _GONE = (
     10.0,
 )  # s without a tick that are told, and without any sign of the vehicle that end a flight
 _RATE_SHARE = 0.75
+_ORDER_TIMEOUT = 0.2  # s for the next tick
 _SHADOW_SECONDS = (0.5, 600.0)
 _MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
 
@@ -316,7 +317,10 @@ class Director:
         except InputError as error:
             self.store.discard(name)
             return str(error)
-        self.flight.try_model(Shadow(watch, self.shadow_limits, self.store.title(name), seconds or 0.0))
+        shadow = Shadow(watch, self.shadow_limits, self.store.title(name), seconds or 0.0)
+        self.flight.try_model(shadow)
+        # The next tick takes it over; an answer before that would describe the state of before.
+        self._wait(lambda: self.flight.candidate is shadow, _ORDER_TIMEOUT)
         return ""
 
     def _make_live(self, name: str, title: str, reason: str) -> dict[str, Any]:
@@ -411,7 +415,7 @@ class Director:
             if reason:
                 return reason
             flight.prepare(progress.mission)
-            self._wait(lambda: flight.phase != IDLE, 0.5)
+            self._wait(lambda: flight.phase != IDLE, _ORDER_TIMEOUT)
         time.sleep(_STREAM_BEFORE_OFFBOARD)
         if flight.sent == sent:
             return "no odometry, so no setpoint could be sent"

@@ -18,11 +18,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from companion.control import IDLE_STEP, Attitude, ControlLaw, ControlStep, State, euler, features
-from companion.controllers import CONTROLLERS, CORRECTED, Controller, TrimLimits, make_controller
+from companion.controllers import Controller, TrimLimits, make_controller
 from companion.guard import Guard
 from companion.shadow import Shadow, error_acceleration
 from companion.vehicle_link import Latest, Odometry
 from companion.watch import Watch
+from models.contract import CONTROLLERS, CORRECTED
 from models.errors import InputError
 from models.reference import Trajectory, transfer
 from models.trajectory import ReferenceSample, Waypoint
@@ -93,12 +94,17 @@ class Mission:
 
 @dataclass(frozen=True)
 class Leg:
-    """A stretch of a flight: fly `trajectory`, then wait up to `settle` s until the vehicle is there."""
+    """A stretch of a flight: fly `trajectory`, then wait up to `settle` s until the vehicle is there.
+
+    `corrects` where the correction acts: from the way to the start on, so that it has faded in when the mission
+    begins, and not while landing.
+    """
 
     phase: str
     trajectory: Trajectory
     settle: float = 0.0
     name: str = ""
+    corrects: bool = False
 
 
 @dataclass(frozen=True)
@@ -349,14 +355,14 @@ class Flight:
         above = (0.0, 0.0, max(start[2], 0.6), self._yaw)
         legs = [
             Leg(TAKEOFF, transfer(self._here, above, safety.climb_speed, 1.5), name="climb"),
-            Leg(TAKEOFF, transfer(above, start, safety.transfer_speed, 2.0), 4.0, "to the start"),
+            Leg(TAKEOFF, transfer(above, start, safety.transfer_speed, 2.0), 4.0, "to the start", True),
         ]
         for i in range(mission.repeat):
             if i and math.dist(end[:3], start[:3]) + abs(end[3] - start[3]) > 1e-6:
                 legs.append(
-                    Leg(TAKEOFF, transfer(end, start, safety.transfer_speed, 2.0), 2.0, "to the start")
+                    Leg(TAKEOFF, transfer(end, start, safety.transfer_speed, 2.0), 2.0, "to the start", True)
                 )
-            legs.append(Leg(MISSION, trajectory, name=trajectory.name))
+            legs.append(Leg(MISSION, trajectory, name=trajectory.name, corrects=True))
         return legs + self._way_home(end)
 
     def _way_home(self, begin: Waypoint) -> list[Leg]:
@@ -376,7 +382,9 @@ class Flight:
             end = leg.trajectory.end
             there = math.dist(position, end[:3]) < _SETTLED_DISTANCE
             still = math.hypot(*odometry.velocity) < _SETTLED_SPEED
-            if late >= leg.settle or (there and still):
+            guard = self.mission.guard if self.mission is not None else None
+            fading = leg.corrects and guard is not None and not guard.tripped and guard.engaged < 1.0
+            if late >= leg.settle or (there and still and not fading):
                 self._next_leg()
                 assert self._leg is not None
                 leg, t = self._leg, self._now - self._leg_begin
@@ -396,22 +404,20 @@ class Flight:
         before = self.phase
         self._leg, self._leg_begin = self._legs.popleft(), self._now
         self.phase = self._leg.phase
-        guard = self.mission.guard if self.mission is not None else None
+        self._correct(self._leg.corrects)
         if self.phase == MISSION and before != MISSION:
             name = self._leg.name
             self.on_event("info", "mission_started", f"flying {name}, {self._leg.trajectory.duration:.1f} s")
-            if guard is not None:
-                guard.start()
-            if self._controller is not None:
-                self._controller.start()
-        elif self.phase == LANDING and before == MISSION:
-            if not self.outcome:
-                self.outcome = "finished"
-                self.on_event("info", "mission_flown", "trajectory flown, landing")
-            if guard is not None:
-                guard.stop()
-            if self._controller is not None:
-                self._controller.stop()
+        elif self.phase == LANDING and before == MISSION and not self.outcome:
+            self.outcome = "finished"
+            self.on_event("info", "mission_flown", "trajectory flown, landing")
+
+    def _correct(self, on: bool) -> None:
+        """Let the correction act from here on, or fade it out; the linear behaviour is expected anew from here."""
+        guard = self.mission.guard if self.mission is not None else None
+        for one in (guard, self._controller):
+            if one is not None:
+                one.start() if on else one.stop()
 
     def _watch_mode(self, latest: Latest) -> None:
         """The pilot wins, and a vehicle that is not armed flies no more."""
@@ -512,10 +518,7 @@ class Flight:
             return
         self.outcome = self.outcome or reason
         self.on_event("warning", kind, f"{reason}: landing {'at home' if return_home else 'here'}")
-        if self.mission is not None and self.mission.guard is not None:
-            self.mission.guard.stop()
-        if self._controller is not None:
-            self._controller.stop()
+        self._correct(False)
         self._legs.clear()
         if return_home:
             self._legs.extend(self._way_home(self._here))

@@ -11,6 +11,7 @@ Whatever the models do, the applied correction stays finite, within the authorit
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import astuple
@@ -167,9 +168,11 @@ class Guard:
             )
         )
 
-    def step(self, rows: Sequence[Sequence[float]], ahead: float, dt: float) -> Correction:
+    def step(
+        self, rows: Sequence[Sequence[float]], ahead: float, dt: float, height: float = math.inf
+    ) -> Correction:
         """The correction for three rows of features: where tilt acts, `ahead` s later, where thrust acts; `dt` s
-        since the last step.
+        since the last step, `height` in m as measured above the ground.
 
         The applied one is finite, within `authority`, and within `slew * dt` of the previous one, always; its rate
         within `slew`.
@@ -191,9 +194,17 @@ class Guard:
                 continue
             x, y, z = x + weight * look.wanted[0], y + weight * look.wanted[1], z + weight * look.wanted[2]
             rx, ry = rx + weight * look.rate[0], ry + weight * look.rate[1]
-        self._applied = self._slewed((x, y, z), dt)
+        self._applied = self._slewed((x, y, min(z, self._most_lift_taken(height))), dt)
         a, b, _ = self.limits.slew
         return Correction(self._applied, (min(a, max(-a, rx)), min(b, max(-b, ry))), raw)
+
+    def _most_lift_taken(self, height: float) -> float:
+        """The greatest loss of thrust (m/s²) that models may ask for at this height above the ground, m.
+
+        A model that expects too much of the ground effect takes thrust away, and down there is no room for that.
+        """
+        share = height / self.limits.ground
+        return self.limits.authority[2] * (1.0 if share > 1.0 else share if share > 0.0 else 0.0)
 
     def _enter(self, watch: Watch) -> None:
         self._live = watch = self._tripped.get(watch.name, watch) if watch.name else watch

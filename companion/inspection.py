@@ -24,6 +24,7 @@ from models.vehicle import Vehicle
 if TYPE_CHECKING:
     from companion.inference import ModelInfo
 
+CHILD = (sys.executable, "-m", "companion.inspection")
 PATIENCE = 30.0
 """Seconds of the wall's clock for one file; on a busy machine the child gets what others leave."""
 PROCESSOR_TIME = 10
@@ -65,11 +66,13 @@ def _ask_child(paths: list[str], vehicle: Vehicle, deadline: float) -> tuple[lis
         "files": paths,
         "vehicle": {key: getattr(vehicle, key) for key in ("name", "mass", "hover_thrust")},
         "deadline": deadline,
+        "processor_time": PROCESSOR_TIME,
+        "memory": MEMORY,
     }
     # One thread for the linear algebra: every other would ask for memory of its own.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     child = subprocess.Popen(
-        [sys.executable, "-m", "companion.inspection"],
+        CHILD,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -134,7 +137,7 @@ def _main() -> None:
     request = json.loads(sys.stdin.read())
     from companion.inference import check_model
 
-    _limit(len(request["files"]))
+    _limit(request["memory"], request["processor_time"] * len(request["files"]))
     vehicle = Vehicle(**request["vehicle"])
     for path in request["files"]:
         try:
@@ -168,13 +171,13 @@ def _main() -> None:
         answers.flush()
 
 
-def _limit(files: int) -> None:
-    """From here on little memory and time, no files and no core dump."""
+def _limit(memory: int, seconds: int) -> None:
+    """From here on `memory` more bytes and `seconds` of the processor at most, no files and no core dump."""
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if sys.platform == "linux" else 0
     if pages:
-        memory = pages * resource.getpagesize() + MEMORY
+        memory += pages * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_TIME * files, PROCESSOR_TIME * files))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 

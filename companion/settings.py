@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from companion.control import Limits
+from companion.controllers import TrimLimits
 from companion.flight import Safety
 from companion.shadow import ShadowLimits
 from companion.watch import GuardLimits
@@ -39,6 +40,7 @@ class Settings:
     limits: Limits = field(default_factory=Limits)
     guard: GuardLimits = field(default_factory=GuardLimits)
     shadow: ShadowLimits = field(default_factory=ShadowLimits)
+    trim: TrimLimits = field(default_factory=TrimLimits)
 
     def checked(self) -> Settings:
         """The same, or `InputError` for a value without sense."""
@@ -86,6 +88,7 @@ def load_settings(path: str | Path | None) -> Settings:
 
 def _filled(default: T, table: dict[str, Any], where: str, section: str) -> T:
     known = {f.name: getattr(default, f.name) for f in fields(default)}  # type: ignore[arg-type]
+    may_be_zero = [f.name for f in fields(default) if f.metadata.get("zero")]  # type: ignore[arg-type]
     changes: dict[str, Any] = {}
     for key, value in table.items():
         name = f"{section}.{key}" if section else key
@@ -93,6 +96,9 @@ def _filled(default: T, table: dict[str, Any], where: str, section: str) -> T:
             close = difflib.get_close_matches(key, list(known), 1)
             hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
             raise InputError(f"{where}: unknown key '{name}'; {hint}")
+        if value == 0 and key in may_be_zero and not isinstance(value, bool):
+            changes[key] = 0.0
+            continue
         changes[key] = _value(known[key], value, f"{where}: '{name}'")
     return replace(default, **changes)  # type: ignore[type-var]
 

@@ -11,7 +11,8 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from companion.actuation import ACTS_AT_ONCE, Actuation
 
@@ -42,7 +43,8 @@ class GuardLimits:
     after `patience` s beyond. `deadline` s for the inferences of one tick: `misses` late ones in a row trip, as
     does a single one of more than `stall` s. One late inference alone says more of the operating system than of
     the model.
-    `fade` s from nothing to full effect and back, and from one model to another.
+    `fade` s from nothing to full effect and back, and from one model to another. Below `ground` m above the ground the
+    thrust that models may take away runs down to nothing.
     """
 
     authority: Vector = (3.0, 3.0, 4.0)
@@ -54,6 +56,16 @@ class GuardLimits:
     misses: int = 5
     stall: float = 0.05
     fade: float = 1.0
+    ground: float = 0.5
+
+
+@runtime_checkable
+class TakesRows(Protocol):
+    """A model that answers several rows of features in one go."""
+
+    def rows(self, rows: Sequence[Sequence[float]]) -> Sequence[Sequence[float]]:
+        """Three accelerations (m/s², heading frame) for each row."""
+        ...
 
 
 class Look(NamedTuple):
@@ -90,7 +102,7 @@ class Watch:
         """Share of the last answer that was believed: 1 in the training range, 0 well outside."""
         self.inference_time = 0.0
         """Seconds that the last call of the model took."""
-        self._model = model
+        self._rows = model.rows if isinstance(model, TakesRows) else partial(_one_by_one, model)
         self._ranges = [(r.name, r.low, r.high, _margin(r, self.limits.margin)) for r in ranges]
         self._clock = clock
         self._late = 0
@@ -129,8 +141,7 @@ class Watch:
         raws: list[Vector] = []
         begin = self._clock()
         try:
-            for features in rows:
-                x, y, z = self._model(features)
+            for x, y, z in self._rows(rows):
                 raws.append((float(x), float(y), float(z)))
         except Exception as error:  # noqa: BLE001 - whatever a model raises, the flight goes on without it
             self.trip(f"the model raised {type(error).__name__}")
@@ -187,6 +198,12 @@ class Watch:
                 if not share >= trust:
                     trust, worst = (share if share > 0.0 else 0.0), name
         return trust, worst
+
+
+def _one_by_one(
+    model: Callable[[Sequence[float]], Sequence[float]], rows: Sequence[Sequence[float]]
+) -> list[Sequence[float]]:
+    return [model(features) for features in rows]
 
 
 def _within(value: float, authority: float) -> float:

@@ -11,6 +11,7 @@ from groundstation import (
     effect_commands,
     flight_commands,
     pilot_commands,
+    reproduce_commands,
     train_commands,
 )
 from models.errors import run_command_line
@@ -18,8 +19,7 @@ from models.errors import run_command_line
 app = typer.Typer(
     name="groundstation",
     help="Runs on the operator's machine: reads flights, compares them with models, names missing effects, "
-    "and "
-    "commands the companion.",
+    "and commands the companion.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -32,6 +32,7 @@ train_commands.register(app)
 pilot_commands.register(app)
 collect_commands.register(app)
 effect_commands.register(app)
+reproduce_commands.register(app)
 
 
 def main() -> None:

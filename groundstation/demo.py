@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +22,7 @@ from groundstation.actuation import actuation_of
 from groundstation.compare import compare, waterfall
 from groundstation.diagnosis import diagnose
 from groundstation.link import Link
+from groundstation.processes import program, running_rig
 from groundstation.reading import read_flight
 from groundstation.results import Comparison, Diagnosis
 from groundstation.settings import Settings
@@ -49,8 +47,6 @@ VEHICLE = Path(__file__).parent.parent / "models" / "vehicles" / "quad5" / "vehi
 SURVEY: tuple[str, dict[str, float]] = ("excitation", {})
 TASK: tuple[str, dict[str, float]] = ("lemniscate", {"speed": 2.5, "height": 0.8})
 MARK = ".trueflight-demo"
-STARTING = 30.0
-"""s that a process may take until it says ready."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,9 @@ def demonstrate(
     _make(folder)
     vehicle = load_vehicle(VEHICLE)
     sealed = folder / "answer.sealed"
-    with _processes(folder, seed, hidden, sealed) as (endpoint, pids):
+    truth = [word for name in (hidden or ["random"]) for word in ("--hidden", name)]
+    truth += ["--seed", str(seed), "--sealed", str(sealed)]
+    with running_rig(folder, VEHICLE, truth) as (endpoint, pids):
         _step(
             console, "Three processes", f"bridge {pids[0]}, companion {pids[1]}, ground station {os.getpid()}"
         )
@@ -97,7 +95,7 @@ def demonstrate(
     if open_viewer and (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"
     ):
-        subprocess.Popen([_program("rerun"), *map(str, recordings)], start_new_session=True)
+        subprocess.Popen([program("rerun"), *map(str, recordings)], start_new_session=True)
     return outcome
 
 
@@ -117,99 +115,6 @@ def _make(folder: Path) -> None:
 def _step(console: Console, title: str, command: str) -> None:
     console.print()
     console.rule(f"[bold]{title}[/bold]  [dim]{command}[/dim]", align="left")
-
-
-# --- processes ---------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _processes(
-    folder: Path, seed: int, hidden: Sequence[str], sealed: Path
-) -> Iterator[tuple[str, tuple[int, int]]]:
-    """Bridge and companion, ready; ended by their ids whatever happens. Yields the Zenoh endpoint."""
-    companion_port, vehicle_port, pilot_port = (_free(socket.SOCK_DGRAM) for _ in range(3))
-    endpoint = f"tcp/127.0.0.1:{_free(socket.SOCK_STREAM)}"
-    effects = [argument for name in (hidden or ["random"]) for argument in ("--hidden", name)]
-    bridge = _start(
-        folder / "bridge.log",
-        ["sim-bridge", "run", "--vehicle", VEHICLE, *effects, "--seed", seed, "--sealed", sealed]
-        + [
-            "--mavlink",
-            f"udpout:127.0.0.1:{companion_port}",
-            "--port",
-            vehicle_port,
-            "--pilot-port",
-            pilot_port,
-        ],
-    )
-    companion = None
-    try:
-        _wait_ready(bridge, folder / "bridge.log")
-        companion = _start(
-            folder / "companion.log",
-            ["companion", "run", "--vehicle", VEHICLE, "--connect", f"udpin://127.0.0.1:{companion_port}"]
-            + [
-                "--listen",
-                endpoint,
-                "--records",
-                folder / "on-board",
-                "--models",
-                folder / "on-board-models",
-            ],
-        )
-        _wait_ready(companion, folder / "companion.log")
-        yield endpoint, (bridge.pid, companion.pid)
-    finally:
-        for process in (companion, bridge):
-            if process is not None:
-                _end(process)
-
-
-def _program(name: str) -> str:
-    """A program of this installation: beside the interpreter, or on the path."""
-    beside = Path(sys.executable).parent / name
-    return str(beside) if beside.exists() else name
-
-
-def _start(log: Path, command: list[object]) -> subprocess.Popen[bytes]:
-    words = [_program(str(command[0])), *map(str, command[1:])]
-    try:
-        with log.open("wb") as out:
-            return subprocess.Popen(words, stdout=out, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
-    except OSError as error:
-        raise InputError(
-            f"{command[0]}: cannot be started ({error.strerror}); pip install 'trueflight[all]'"
-        ) from None
-
-
-def _wait_ready(process: subprocess.Popen[bytes], log: Path) -> None:
-    end = time.monotonic() + STARTING
-    while time.monotonic() < end:
-        text = log.read_text(errors="replace")
-        if "ready:" in text:
-            return
-        if process.poll() is not None:
-            last = (text.strip().splitlines() or ["it said nothing"])[-1]
-            raise InputError(f"{log.stem} ended before it was ready: {last} (see {log})")
-        time.sleep(0.05)
-    raise InputError(f"{log.stem} was not ready within {STARTING:g} s; see {log}")
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    for ask, patience in ((signal.SIGINT, 10.0), (signal.SIGKILL, 5.0)):
-        if process.poll() is not None:
-            return
-        process.send_signal(ask)
-        try:
-            process.wait(patience)
-        except subprocess.TimeoutExpired:
-            continue
-
-
-def _free(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 # --- the job -----------------------------------------------------------------------------------------------------
@@ -303,7 +208,7 @@ def _reveal(sealed: Path, hidden: Sequence[str]) -> str:
     if hidden:
         return ", ".join(hidden)
     done = subprocess.run(
-        [_program("sim-bridge"), "reveal", str(sealed)], capture_output=True, text=True, check=False
+        [program("sim-bridge"), "reveal", str(sealed)], capture_output=True, text=True, check=False
     )
     if done.returncode:
         raise InputError(f"sim-bridge reveal failed: {done.stderr.strip()}")

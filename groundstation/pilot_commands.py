@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from models.contract import CONTROLLERS
 from models.errors import InputError
 
 if TYPE_CHECKING:
@@ -90,7 +91,8 @@ def fly_command(
     trajectory: Annotated[
         str, typer.Argument(help="Name of a trajectory (`groundstation fly list`), or a CSV of setpoints.")
     ],
-    controller: Annotated[str, typer.Option(help="lqr, or corrected by the deployed model.")] = "lqr",
+    controller: Annotated[str, typer.Option(help="lqr, lqr_integral, or corrected by the deployed model.")
+    ] = "lqr",
     parameters: Annotated[
         list[str] | None, typer.Option("--set", help="Parameter of the trajectory, NAME=VALUE.")
     ] = None,
@@ -113,8 +115,8 @@ def fly_command(
     if trajectory == "list":
         _list_trajectories(as_json)
         return
-    if controller not in ("lqr", "corrected"):
-        raise InputError(f"--controller is '{controller}'; it must be lqr or corrected")
+    if controller not in CONTROLLERS:
+        raise InputError(f"--controller is '{controller}'; choose one of {', '.join(CONTROLLERS)}")
     mission = {**_mission(trajectory, parameters or []), "controller": controller, "repeat": repeat}
     settings = _settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
     from groundstation.link import Link

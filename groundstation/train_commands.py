@@ -83,7 +83,7 @@ def train_command(
     """
     from groundstation.as_json import network_summary, plain
     from groundstation.store import save as save_version
-    from groundstation.training import recipe_named, train, with_epochs
+    from groundstation.training import memory_share, recipe_named, train, with_epochs
 
     widths, chosen = _widths(layers), with_epochs(recipe_named(recipe), epochs)
     flights = read_flights(flight, vehicle, mapping, quiet=as_json)
@@ -118,8 +118,10 @@ def train_command(
                     "parent": made.parent,
                     "path": str(path),
                     "flights": list(samples.flights),
+                    "left_out": list(samples.left_out),
                     "minutes": samples.seconds / 60.0,
                     "best_epoch": done.best,
+                    "memory_share": memory_share(samples, done),
                     "network": network_summary(done.network),
                     "recording": None if save is None else str(save),
                 }
@@ -287,6 +289,8 @@ def _bar(what: str, total: int) -> Iterator[Callable[[int, str], None]]:
 def _print_training(done: Training, samples: Samples, base: Model) -> None:
     from rich.table import Table
 
+    from groundstation.training import MATERIAL_MEMORY, memory_share
+
     network, fit = done.network, done.network.fit
     minutes = samples.seconds / 60.0
     table = Table(
@@ -316,9 +320,20 @@ def _print_training(done: Training, samples: Samples, base: Model) -> None:
         style="dim",
         highlight=False,
     )
+    for reason in samples.left_out:
+        console.print(f"left out: {reason}", style="yellow", highlight=False)
     unused = [n for n in samples.names if n not in network.features]
     if unused:
         console.print(f"not used, for it did not vary in these flights: {', '.join(unused)}", style="yellow")
+    share = memory_share(samples, done)
+    if share > MATERIAL_MEMORY:
+        console.print(
+            f"{100 * share:.0f} % of what is left in z goes with the rate at which thrust changes: lag or delay are "
+            "not as believed, and a network has no memory. Add motor_lag or transport_delay first; "
+            "'groundstation diagnose' tells which",
+            style="yellow",
+            highlight=False,
+        )
     if base.network is not None:
         console.print(f"replaces the network of v{base.version}", style="yellow")
 
@@ -331,25 +346,22 @@ def _print_ablation(result: Ablation) -> None:
         f"{result.noise_floor:.4f}",
         title_justify="left",
     )
-    for column in (
-        "hidden layers",
-        "parameters",
-        "trained on",
-        "held out",
-        "ONNX",
-        "inference",
-        "training",
-        "",
-    ):
-        table.add_column(column, justify="left" if column in ("hidden layers", "") else "right", no_wrap=True)
+    for column in ("layers", "numbers", "trained", "held out", "kB", "µs", "s", ""):
+        table.add_column(column, justify="left" if column in ("layers", "") else "right", no_wrap=True)
     for r in result.networks:
-        marks = [w for w, is_it in (("best", r.best), ("smallest within 5 %", r.smallest)) if is_it]
+        marks = [w for w, is_it in (("best", r.best), ("embed this", r.smallest)) if is_it]
         table.add_row(
             r.label, str(r.parameters), f"{r.train_rms:.4f}", f"{r.validation_rms:.4f}",
-            f"{r.onnx_bytes / 1000:.1f} kB", f"{1e6 * r.inference:.1f} µs", f"{r.seconds:.1f} s", ", ".join(marks),
+            f"{r.onnx_bytes / 1000:.1f}", f"{1e6 * r.inference:.1f}", f"{r.seconds:.1f}", ", ".join(marks),
             style="bold green" if r.smallest else "",
         )  # fmt: skip
     console.print(table)
+    console.print(
+        "numbers: trained parameters; kB of the exported file and µs of one inference (ONNX Runtime, one thread) with "
+        "the base's effects; s of training; embed this: the smallest within 5 % of the best",
+        style="dim",
+        highlight=False,
+    )
     if not result.features:
         return
     table = Table(

@@ -25,11 +25,13 @@ from groundstation.training_data import Samples, split
 from models.contract import FEATURES, YAW_FEATURES
 from models.errors import InputError
 from models.export import sequential
-from models.network import Network
+from models.network import Network, error_acceleration_of
 
 WIDTHS = (64, 64)
 """Hidden layers of the paper."""
 CHECKPOINT_SECONDS = 5.0
+MATERIAL_MEMORY = 0.1
+"""Share of the remaining error from which a lag that the base model lacks is told of."""
 _FLOORS = {"m": 0.1, "m/s": 0.2, "V": 0.2, "1": 0.01, "N": 0.1}
 """Least scale of an input, by unit, so that a small step outside the training range stays a small step."""
 
@@ -64,6 +66,9 @@ class Recipe:
 PAPER = Recipe("paper", "nadam", 0.05, 256, 1000, "plateau")
 """Carvalho et al. 2022, section V. Patience of the plateau, and of the end, are not in the paper: 10 is Keras's."""
 OWN = Recipe("default", "adamw", 0.02, 1024, 60, "one_cycle", weight_decay=0.1, average=1.0, patience=30)
+RANGE_TAIL = 0.001
+"""Share of the samples at each end of a feature that does not count to the training range: a network has learnt
+nothing where it has seen a handful of samples."""
 RECIPES = {"default": OWN, "paper": PAPER}
 
 
@@ -171,7 +176,7 @@ class _Run:
         self.centre = x.mean(axis=0)
         self.scale = np.maximum(x.std(axis=0), [_FLOORS[units[n]] for n in samples.names]).astype(np.float32)
         self.out = np.maximum(y.std(axis=0), 1e-3).astype(np.float32)
-        self.low, self.high = x.min(axis=0), x.max(axis=0)
+        self.low, self.high = np.quantile(x, (RANGE_TAIL, 1.0 - RANGE_TAIL), axis=0).astype(np.float32)
         self.x, self.y = (self._normalised(samples.only(side)) for side in sides)
         # squared error in (m/s²)², whatever the scale of each output
         self.weight = torch.from_numpy(self.out**2)
@@ -407,6 +412,21 @@ def _threads(count: int) -> Iterator[None]:
 
 def _three(values: np.ndarray) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
+
+
+def memory_share(samples: Samples, training: Training) -> float:
+    """Part of the held-out squared error in z, 0 to 1, that goes with the rate of change of thrust.
+
+    A static map cannot follow a lag or a delay: to first order what it misses is proportional to that rate.
+    """
+    held = samples.only(training.validation)
+    features = held.with_features(training.network.features).features
+    left = (held.target - error_acceleration_of(training.network, features))[:, 2].astype(float)
+    thrust = held.features[:, held.names.index("T")].astype(float)
+    following = (np.diff(held.t, prepend=-1.0) < 1.5 * held.period) & (np.diff(held.flight, prepend=-1) == 0)
+    rate = np.where(following, np.diff(thrust, prepend=thrust[0]) / held.period, 0.0)
+    power = float(rate @ rate * (left @ left))
+    return float(rate @ left) ** 2 / power if power > 0.0 else 0.0
 
 
 def with_epochs(recipe: Recipe, epochs: int | None) -> Recipe:

@@ -3,7 +3,7 @@
 Both sides pass the project's low-pass: the target as the comparison of a model with a flight does it, and the features
 as well, so that a network sees the motion that the measured acceleration belongs to and little of the sensors' noise.
 Thrust is the commanded one after the known delay and lag, and effects with memory act in the base's prediction: what is
-left to learn is static. Samples that a comparison leaves out are left out here.
+left to learn is static. Samples that a comparison leaves out are left out here, and those on or just above the ground.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import ndimage
 
 from groundstation.compare import heading_acceleration, heading_noise
 from groundstation.fitting import with_clock
@@ -33,6 +34,10 @@ LONGEST_BLOCK, SHORTEST_BLOCK = 20.0, 4.0
 """s of a block that is trained on or held out as one."""
 GAP = 1.0
 """s left out on each side of the border between a trained and a held-out block: longer than filters and lags reach."""
+TOUCHING = 0.03
+"""m above ground: lower, the ground may carry the vehicle, and its push would be taken for thrust."""
+AFTER_TOUCHING = 0.5
+"""s around such a moment that are left out as well: filters spread the shock."""
 LEAST_SECONDS = 20.0
 """s of usable flight below which nothing is trained."""
 _VARIES = {"m": 0.05, "m/s": 0.1, "V": 0.05, "1": 0.002, "N": 0.02}
@@ -46,6 +51,7 @@ class Samples:
     `features` (N, F) in the order of `names`, units as in `models.contract`; `target` (N, 3) is the measured minus the
     base model's acceleration, heading frame, m/s², with noise of RMS `noise` (3,); `flight` (N,) numbers the flights
     of `flights`, `t` (N,) is each flight's own clock in s and `block` (N,) the unit that is held out as a whole.
+    `left_out` tells of each flight that nothing could be taken from, and why.
     """
 
     names: tuple[str, ...]
@@ -58,6 +64,7 @@ class Samples:
     flights: tuple[str, ...]
     data_hash: str
     period: float
+    left_out: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.target)
@@ -100,15 +107,22 @@ def samples_of_flights(
     """The training set of `flights` for a network beside the effects of `model` (a network of its own is ignored).
 
     `advance` is called after each flight. Raises `InputError` where a flight lacks position, velocity, attitude or
-    command, or where too little of all flights can be used.
+    command, or where too little of all flights can be used; one flight of many may be too short or too wild.
     """
     names = feature_names(model.names())
-    parts = []
+    parts, left_out = [], []
     for number, flight in enumerate(flights):
         for column in ("position", "velocity", "quaternion", "thrust_command"):
             flight.column(column)
-        parts.append(_of_flight(flight, number, model, names, bandwidth))
+        try:
+            parts.append(_of_flight(flight, number, model, names, bandwidth))
+        except InputError as error:
+            if len(flights) == 1:
+                raise
+            left_out.append(str(error))
         advance()
+    if not parts:
+        raise InputError(f"none of {len(flights)} flights can be used; the last one: {left_out[-1]}")
     samples = Samples(
         names=names,
         features=np.concatenate([p.features for p in parts]),
@@ -120,6 +134,7 @@ def samples_of_flights(
         flights=tuple(f.name for f in flights),
         data_hash="+".join(f.data_hash for f in flights),
         period=float(np.median([p.period for p in parts])),
+        left_out=tuple(left_out),
     )
     if samples.seconds < LEAST_SECONDS:
         raise InputError(
@@ -140,6 +155,10 @@ def _of_flight(
     delivered = act(motion, [(effect, values) for effect, values in chain if effect.stage is Stage.COMMAND])
     features = measurement.smooth(np.asarray(features_of_motion(delivered, names)))
     used = measurement.used & np.all(np.isfinite(target), axis=1) & np.all(np.isfinite(features), axis=1)
+    touching = ndimage.binary_dilation(
+        flight.column("position")[:, 2] < TOUCHING, iterations=max(1, round(AFTER_TOUCHING / flight.dt))
+    )
+    used &= ~touching
     count = int(used.sum())
     return Samples(
         names=names,

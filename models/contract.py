@@ -6,6 +6,9 @@ import hashlib
 
 CONTRACT_VERSION = "1"
 
+CONTROLLERS = LQR, LQR_INTEGRAL, CORRECTED = ("lqr", "lqr_integral", "corrected")
+"""What a mission can be flown with: the cascade, the cascade with an integral, the cascade with its correction."""
+
 INPUT_NAME, OUTPUT_NAME = "features", "delta"
 """float32 [N, F] in, float32 [N, 3] out: error acceleration in m/s², heading frame."""
 

@@ -67,9 +67,14 @@ def sequential(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Sequ
     return torch.nn.Sequential(*modules)
 
 
+LOOKED_OVER = ("transport_delay", "motor_lag", "rate_loop_lag")
+"""Effects that the corrected controller undoes by looking ahead, not by the correction."""
+
+
 def not_exported(model: Model) -> tuple[str, ...]:
-    """Effects of the model that a static correction cannot hold: those with memory, and errors of the sensor."""
-    return tuple(e.name for e, _ in model.effect_chain() if not e.exports or e.stage is Stage.SENSOR)
+    """Effects of the model that a vehicle cannot correct: other ones with memory, and errors of the sensor."""
+    held = [e for e, _ in model.effect_chain() if not e.exports or e.stage is Stage.SENSOR]
+    return tuple(e.name for e in held if e.name not in LOOKED_OVER)
 
 
 def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] | None = None) -> bytes:

@@ -193,8 +193,12 @@ def fly(
         str, typer.Option(help="lqr, lqr_integral, corrected; corrected where a model is given.")
     ] = "",
     trim: Annotated[
-        float, typer.Option(help="Bandwidth of the slow trim of `corrected`, rad/s; 0: none.", min=0, max=1)
-    ] = 0.25,
+        float | None,
+        typer.Option(help="Bandwidth of the slow trim of `corrected`, rad/s; 0: none.", min=0, max=1),
+    ] = None,
+    settle: Annotated[
+        float, typer.Option(help="s to hold the start before the trajectory begins.", min=0, max=60)
+    ] = 0.0,
     repeat: Annotated[int, typer.Option(help="How often the trajectory is flown.", min=1)] = 1,
     rate: Annotated[float, typer.Option(help="Control rate, Hz.")] = 100.0,
     hidden: HiddenNames = None,
@@ -241,7 +245,8 @@ def fly(
         settings.sensor_noise,
         settings.battery,
         controller,
-        TrimLimits(bandwidth=trim),
+        settle,
+        TrimLimits() if trim is None else TrimLimits(bandwidth=trim),
     )
     csv_file = output.with_suffix(".csv") if table else None
     seconds = plan.repeat * plan.trajectory.duration

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from companion.control import ControlLaw, ControlStep, State
-from companion.controllers import CORRECTED, LQR, Preview, TrimLimits, make_controller
+from companion.controllers import Preview, TrimLimits, make_controller
 from companion.guard import Guard
 from companion.inference import check_model
+from models.contract import CORRECTED, LQR
 from models.design import Design
 from models.errors import InputError
 from models.flight import COLUMNS
@@ -42,7 +43,8 @@ class Plan:
     bytes.
 
     `controller` is one of `companion.controllers.CONTROLLERS`; `corrected` needs a `model`, the others take none.
-    Where it is empty the vehicle flies `corrected` with a model and `lqr` without.
+    Where it is empty the vehicle flies `corrected` with a model and `lqr` without. For `settle` s the vehicle holds
+    the start before the trajectory begins, as the companion does: a correction has faded in by then.
     """
 
     vehicle: Vehicle
@@ -56,6 +58,7 @@ class Plan:
     noise: Noise | None = None
     battery: BatteryState = FULL
     controller: str = ""
+    settle: float = 0.0
     trim: TrimLimits = field(default_factory=TrimLimits)
 
     def __post_init__(self) -> None:
@@ -86,6 +89,7 @@ class Sample(NamedTuple):
     motors: list[float]
     guard: str
     inference: float
+    mission: bool
 
 
 @dataclass(frozen=True)
@@ -130,12 +134,15 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     ticks, touching, outcome = 0, 0, "finished"
     if guard is not None:
         guard.start()
+    waiting = math.ceil(plan.settle / period - 1e-9)
     controller.start()
     reported, step = simulator.reported, simulator.step
     status, inference = "off", 0.0
     begin = time.perf_counter()
     for preview in _previews(plan, period):
         reference = preview(0.0)
+        if ticks == waiting and waiting:
+            controller.start()
         now = reported()
         px, py, pz = now.position
         position = (px, py, pz - ground)
@@ -151,7 +158,9 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
         control = controller.step(state, preview, period if ticks else 0.0)
         if guard is not None:
             status, inference = guard.status, guard.inference_time
-        on_sample(Sample(now, position, reference, control, simulator.motors, status, inference))
+        on_sample(
+            Sample(now, position, reference, control, simulator.motors, status, inference, ticks >= waiting)
+        )
         ticks += 1
         rx, ry, rz = reference.position
         ex, ey, ez = px - rx, py - ry, position[2] - rz
@@ -202,7 +211,10 @@ def _previews(plan: Plan, period: float) -> Iterator[Preview]:
         if turn and back is not None:
             legs.append(back)
         legs.append(trajectory)
-    offset, tick = 0.0, 0
+    offset, tick = plan.settle, 0
+    while tick * period < plan.settle - 1e-9:
+        yield partial(_ahead, trajectory, tick * period - plan.settle)
+        tick += 1
     for leg in legs:
         while tick * period - offset < leg.duration:
             yield partial(_ahead, leg, tick * period - offset)
@@ -271,7 +283,6 @@ class _TickWriter:
         self._tick = Tick(
             controller=plan.controller,
             trajectory=plan.trajectory.name,
-            phase="mission",
             flight_mode="OFFBOARD",
             armed=True,
             setpoint_sent=True,
@@ -320,6 +331,7 @@ class _TickWriter:
         tick.battery_voltage = now.battery_voltage
         tick.rotor_speed[:] = now.rotor_speed
         tick.guard = sample.guard
+        tick.phase = "mission" if sample.mission else "takeoff"
         tick.inference = sample.inference
         tick.interval = self._interval
         self.messages.append((tick.SerializeToString(), now.time_us, host))

@@ -196,10 +196,11 @@ def state(vehicle: str, tick: Tick | None, silent: float, models: dict[str, Any]
     if tick.shadow:
         about = known.get("shadow") or {}
         same = about.get("hash") == tick.shadow
-        left = f", {about['remaining']:.0f} s to go" if same else ""
         lines.append(
-            f"| in the shadow | {_called(tick.shadow, {tick.shadow: _bare(about) if same else ''})}{left} |"
+            f"| in the shadow | {_called(tick.shadow, {tick.shadow: _bare(about) if same else ''})} |"
         )
+        if same:
+            lines.append(f"| shadow to go | {about['remaining']:.0f} s |")
     if known.get("last_good"):
         lines.append(f"| last good | {_called(known['last_good'], names)} |")
     lines += [

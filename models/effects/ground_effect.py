@@ -16,9 +16,10 @@ def formula(motion: Motion, *, rho: Array) -> Motion:
     xp = array_namespace(motion.thrust)
     arms = motion.vehicle.rotor_positions or ((0.0, 0.0, 0.0),)
     up = motion.rotation[:, 2, :]  # world z in body axes
+    above = motion.height + motion.vehicle.rotor_height
     total = 0.0 * motion.thrust
     for x, y, z in arms:
-        height = xp.clip(motion.height + up[:, 0] * x + up[:, 1] * y + up[:, 2] * z, 1e-3, None)
+        height = xp.clip(above + up[:, 0] * x + up[:, 1] * y + up[:, 2] * z, 1e-3, None)
         ratio = rho * motion.vehicle.rotor_radius / (4.0 * height)
         total = total + 1.0 / (1.0 - xp.clip(ratio * ratio, 0.0, STRONGEST))
     return motion.with_(thrust=motion.thrust * (total / float(len(arms))))

@@ -696,7 +696,7 @@ class Gyroscopic(Effect):
 
 
 RICH: dict[str, tuple[float, float]] = {
-    "rotor_drag": (0.20, 0.35),
+    "rotor_drag": (0.40, 0.60),
     "parasitic_drag": (0.01, 0.03),
     "ground_effect": (1.2, 2.0),
     "battery_sag": (1.2, 1.8),
@@ -713,7 +713,7 @@ def rich(vehicle: Vehicle, seed: int) -> tuple[Hidden, ...]:
 
     Magnitudes of the order known of such vehicles, drawn by the seed:
 
-    * rotor drag, some tenths of 1/s: Faessler, Franchi, Scaramuzza, RA-L 2018, identify it in flight.
+    * rotor drag around 0.5 1/s: Faessler, Franchi, Scaramuzza, RA-L 2018, identify about that in flight (0.54, 0.39).
     * parasitic drag: drag areas of 0.012 to 0.037 m² at 0.75 kg, a bluff body of that frontal area (Hoerner 1965).
     * ground effect: effective radii of 1.2 to 2 propellers (Sanchez-Cuenca et al. 2017).
     * battery: thrust goes with the square of the voltage of an unloaded motor and with less of a loaded one.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,30 +41,45 @@ def linear_model(
     """`delta = features @ weights + bias` with metadata; `metadata` replaces, `drop` removes one."""
     weights = np.asarray(weights, dtype=np.float32)
     width = len(weights)
-    names = [*contract.FEATURES, *contract.YAW_FEATURES][:width]
-    units = {**contract.FEATURES, **contract.YAW_FEATURES}
     nodes = [helper.make_node("MatMul", [input_name, "w"], ["h0"])]
     nodes += [helper.make_node("Sin", [f"h{i}"], [f"h{i + 1}"]) for i in range(extra_nodes)]
     nodes.append(helper.make_node("Add", [f"h{extra_nodes}", "b"], [contract.OUTPUT_NAME]))
+
+    def values(features: np.ndarray) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            delta = features @ weights
+        for _ in range(extra_nodes):
+            delta = np.sin(delta)
+        return delta + np.asarray(bias, dtype=np.float32) + golden_error
+
+    constants = {"w": weights, "b": np.asarray(bias, dtype=np.float32)}
+    return packed(nodes, constants, values, width, metadata, drop, input_name)
+
+
+def packed(
+    nodes: list[Any],
+    constants: dict[str, np.ndarray],
+    values_of: Callable[[np.ndarray], np.ndarray],
+    width: int = len(contract.FEATURES),
+    metadata: dict[str, Any] | None = None,
+    drop: str = "",
+    input_name: str = contract.INPUT_NAME,
+) -> bytes:
+    """A graph as a file of the contract; `values_of` computes its golden outputs from its golden inputs."""
+    names = [*contract.FEATURES, *contract.YAW_FEATURES][:width]
+    units = {**contract.FEATURES, **contract.YAW_FEATURES}
     graph = helper.make_graph(
         nodes,
         "delta",
         [helper.make_tensor_value_info(input_name, TensorProto.FLOAT, ["N", width])],
         [helper.make_tensor_value_info(contract.OUTPUT_NAME, TensorProto.FLOAT, ["N", 3])],
-        [
-            numpy_helper.from_array(weights, "w"),
-            numpy_helper.from_array(np.asarray(bias, dtype=np.float32), "b"),
-        ],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     features = np.random.default_rng(3).uniform(
         [RANGES[n][0] for n in names], [RANGES[n][1] for n in names], size=(4, width)
     )
-    with np.errstate(over="ignore"):
-        delta = features.astype(np.float32) @ weights
-    for _ in range(extra_nodes):
-        delta = np.sin(delta)
-    delta = delta + np.asarray(bias, dtype=np.float32) + golden_error
+    delta = values_of(features.astype(np.float32))
     values = {
         contract.KEY_CONTRACT: contract.CONTRACT_VERSION,
         contract.KEY_NAME: "linear",
@@ -92,9 +107,111 @@ def constant_model(x: float, y: float, z: float, **changes: Any) -> bytes:
     return linear_model(np.zeros((len(contract.FEATURES), 3)), (x, y, z), **changes)
 
 
-def drag_model(drag: float) -> bytes:
+def drag_model(drag: float, **changes: Any) -> bytes:
     """A model of linear drag in the heading frame: `delta = -drag (vx, vy, 0)`."""
     weights = np.zeros((len(contract.FEATURES), 3))
     names = list(contract.FEATURES)
     weights[names.index("vx"), 0] = weights[names.index("vy"), 1] = -drag
-    return linear_model(weights)
+    return linear_model(weights, **changes)
+
+
+def nan_model(drag: float, limit: float) -> bytes:
+    """Drag that becomes not a number where vx is above `limit` (m/s), the end of its stated training range."""
+    names = list(contract.FEATURES)
+    weights = np.zeros((len(names), 3), dtype=np.float32)
+    weights[names.index("vx"), 0] = weights[names.index("vy"), 1] = -drag
+    pick = np.zeros((len(names), 1), dtype=np.float32)
+    pick[names.index("vx")] = -1.0
+    nodes = [
+        helper.make_node("MatMul", [contract.INPUT_NAME, "pick"], ["backward"]),
+        helper.make_node("Add", ["backward", "limit"], ["left"]),
+        helper.make_node("Sqrt", ["left"], ["root"]),
+        helper.make_node("Mul", ["root", "nothing"], ["none"]),
+        helper.make_node("MatMul", [contract.INPUT_NAME, "w"], ["drag"]),
+        helper.make_node("Add", ["drag", "none"], [contract.OUTPUT_NAME]),
+    ]
+    constants = {
+        "pick": pick,
+        "limit": np.array([limit], dtype=np.float32),
+        "nothing": np.zeros((1, 3), dtype=np.float32),
+        "w": weights,
+    }
+    golden = np.zeros((3, len(names)))
+    ranges = [
+        {
+            "name": name,
+            "unit": unit,
+            "low": -limit if name == "vx" else RANGES[name][0],
+            "high": limit if name == "vx" else RANGES[name][1],
+        }
+        for name, unit in contract.FEATURES.items()
+    ]
+    metadata = {
+        contract.KEY_FEATURES: ranges,
+        contract.KEY_GOLDEN_FEATURES: golden.tolist(),
+        contract.KEY_GOLDEN_DELTA: np.zeros((3, 3)).tolist(),
+    }
+    return packed(nodes, constants, lambda features: features @ weights, metadata=metadata)
+
+
+def deep_model(width: int = 800, depth: int = 40) -> bytes:
+    """A network of `depth` equal layers: it keeps to the contract, and takes milliseconds."""
+    rng = np.random.default_rng(5)
+    constants = {
+        "first": rng.normal(size=(len(contract.FEATURES), width)).astype(np.float32) / 10.0,
+        "layer": rng.normal(size=(width, width)).astype(np.float32) / width**0.5,
+        "last": np.zeros((width, 3), dtype=np.float32),
+    }
+    nodes = [helper.make_node("MatMul", [contract.INPUT_NAME, "first"], ["h0"])]
+    for i in range(depth):
+        nodes.append(helper.make_node("MatMul", [f"h{i}", "layer"], [f"m{i}"]))
+        nodes.append(helper.make_node("Tanh", [f"m{i}"], [f"h{i + 1}"]))
+    nodes.append(helper.make_node("MatMul", [f"h{depth}", "last"], [contract.OUTPUT_NAME]))
+    return packed(nodes, constants, lambda features: np.zeros((len(features), 3)))
+
+
+def endless_model() -> bytes:
+    """A graph that counts to 2^62 before it answers."""
+    body = helper.make_graph(
+        [
+            helper.make_node("Identity", ["go"], ["go_on"]),
+            helper.make_node("Identity", ["held"], ["kept"]),
+        ],
+        "body",
+        [
+            helper.make_tensor_value_info("i", TensorProto.INT64, []),
+            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("held", TensorProto.FLOAT, None),
+        ],
+        [
+            helper.make_tensor_value_info("go_on", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("kept", TensorProto.FLOAT, None),
+        ],
+    )
+    nodes = [
+        helper.make_node("MatMul", [contract.INPUT_NAME, "w"], ["h"]),
+        helper.make_node("Loop", ["often", "", "h"], [contract.OUTPUT_NAME], body=body),
+    ]
+    constants = {
+        "w": np.zeros((len(contract.FEATURES), 3), dtype=np.float32),
+        "often": np.array(2**62, dtype=np.int64),
+    }
+    return packed(nodes, constants, lambda features: np.zeros((len(features), 3)))
+
+
+def greedy_model() -> bytes:
+    """A graph that wants 40 GB to answer."""
+    nodes = [
+        helper.make_node("Expand", ["one", "shape"], ["much"]),
+        helper.make_node("ReduceSum", ["much"], ["sum"], keepdims=0),
+        helper.make_node("Mul", ["sum", "zero"], ["nothing"]),
+        helper.make_node("MatMul", [contract.INPUT_NAME, "w"], ["h"]),
+        helper.make_node("Add", ["h", "nothing"], [contract.OUTPUT_NAME]),
+    ]
+    constants = {
+        "one": np.ones(1, dtype=np.float32),
+        "shape": np.array([10**5, 10**5], dtype=np.int64),
+        "zero": np.zeros(1, dtype=np.float32),
+        "w": np.zeros((len(contract.FEATURES), 3), dtype=np.float32),
+    }
+    return packed(nodes, constants, lambda features: np.zeros((len(features), 3)))

@@ -47,7 +47,7 @@ class Oracle:
         self.delta, self.actuation, self.engaged = delta, actuation, engaged
         self.applied = ZERO
 
-    def step(self, rows: Sequence[list[float]], ahead: float, dt: float) -> Correction:
+    def step(self, rows: Sequence[list[float]], ahead: float, dt: float, height: float) -> Correction:
         now, later, lifted = (self.delta(row) for row in rows)
         self.applied = (now[0], now[1], lifted[2])
         return Correction(
@@ -215,7 +215,7 @@ def test_the_trim_turns_with_the_vehicle_for_what_stands_still_in_the_world() ->
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.integers(0, 10**6), st.floats(0.005, 0.08), st.floats(0.01, 0.1), st.floats(0.0, 8.0))
+@given(st.integers(0, 10**6), st.floats(0.005, 0.08), st.floats(0.02, 0.1), st.floats(0.0, 8.0))
 def test_the_rate_model_tells_what_the_commands_on_their_way_will_do(seed, delay, lag, integral) -> None:
     """Undelayed response minus delayed response, against the ground's own simulation of the same loop."""
     command = np.cumsum(np.random.default_rng(seed).normal(size=(200, 2)), axis=0) * 0.05
@@ -298,6 +298,15 @@ def test_the_integral_holds_a_constant_push_and_does_not_wind_up() -> None:
         controller.step(far, lambda ahead: still, DT)
     home = replace_position(far, (0.0, 0.0, 1.0))
     assert controller.step(home, lambda ahead: still, DT).command.body_rate[1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_ground_effect_that_is_expected_too_strong_does_not_pull_the_vehicle_down() -> None:
+    """Corrected at the measured height this falls: the correction loses more with height than the loop gives."""
+    cushion = lambda gain: lambda features: (0.0, 0.0, gain * 8.0 * math.exp(-features[0] / 0.06))  # noqa: E731
+    low = trajectory("lemniscate", height=0.15)
+    vehicle = Linear(delta=cushion(1.0))
+    error = flown(Corrected(LAW, Oracle(cushion(2.0)), TrimLimits()), vehicle, low)
+    assert np.abs(error[:, 2]).max() < 0.05
 
 
 def replace_position(state: State, position: tuple[float, float, float]) -> State:

@@ -271,14 +271,14 @@ def test_cancelled_before_takeoff_it_streams_no_more() -> None:
     assert rig.tick().step is None, "nothing to take off for"
 
 
-def test_the_correction_is_on_in_the_mission_only() -> None:
+def test_the_correction_is_on_when_the_mission_begins_and_off_after_it() -> None:
     ranges = [Range(name, unit, -100.0, 100.0) for name, unit in FEATURES.items()]
     guard = Guard(lambda features: (1.0, 0.0, 0.0), ranges, name="abc")
     rig = Rig()
     rig.take_off(Mission("m1", trajectory("hover", duration=6.0), "corrected", 1, guard))
-    for out in rig.until(MISSION)[:-1]:
-        assert out.step is not None
-        assert out.step.correction == (0.0, 0.0, 0.0)
+    climb = rig.run(1.0)
+    assert all(out.step is not None and out.step.correction == (0.0, 0.0, 0.0) for out in climb)
+    assert rig.until(MISSION)[-1].guard == "active"  # faded in on the way to the start
     rig.push = (1.0, 0.0, 0.0)
     flown = rig.until(LANDING)
     assert flown[-2].guard == "active"

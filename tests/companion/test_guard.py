@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.guard import Guard, GuardLimits, Range
+from models.contract import FEATURES
 
 LIMITS = GuardLimits(fade=0.5)
 RANGES = (Range("z", "m", 0.0, 2.0), Range("vx", "m/s", -2.0, 2.0))
@@ -259,6 +260,23 @@ def test_a_feature_that_hardly_moved_in_training_has_a_margin_of_its_unit() -> N
     assert run(guard, 1.0, (15.75, 7.0, 1.0))[-1][0] == pytest.approx(0.5)
     assert run(guard, 0.5, (16.0, 7.35, 1.0))[-1][0] == pytest.approx(0.5)
     assert run(guard, 0.5, (16.0, 7.0, 0.95))[-1][0] == pytest.approx(0.5)
+
+
+def test_near_the_ground_a_model_may_add_thrust_but_take_little_away() -> None:
+    def applied(height: float, delta: float) -> float:
+        ranges = [Range(name, unit, -100.0, 100.0) for name, unit in FEATURES.items()]
+        guard = Guard(lambda features: (0.0, 0.0, delta), ranges)
+        guard.start()
+        row = [height, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 16.0, 7.0]
+        for _ in range(200):
+            correction = guard.step([row, row, row], 0.02, 0.01, height)
+        return correction.applied[2]
+
+    limits = GuardLimits()
+    assert applied(2.0 * limits.ground, 3.0) == pytest.approx(3.0)
+    assert applied(0.2 * limits.ground, 3.0) == pytest.approx(0.2 * limits.authority[2])
+    assert applied(-0.1, 3.0) == 0.0
+    assert applied(0.1 * limits.ground, -3.0) == pytest.approx(-3.0)
 
 
 def test_a_gap_gives_no_jump() -> None:

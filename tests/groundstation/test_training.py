@@ -15,7 +15,7 @@ from groundstation.diagnosis import diagnose
 from groundstation.reading import read_flight
 from groundstation.store import add_effect, find, lineage, save
 from groundstation.train_commands import read_flights
-from groundstation.training import OWN, PAPER, recipe_named, train
+from groundstation.training import MATERIAL_MEMORY, OWN, PAPER, memory_share, recipe_named, train
 from groundstation.training_data import GAP, blocks, samples_of_flights, split
 from models.errors import InputError
 from models.export import export_onnx
@@ -179,6 +179,36 @@ def test_feature_that_never_varies_is_not_used(flights, base, unseen) -> None:
     network = train(samples, replace(QUICK, epochs=1), (8,), 0).network
     assert "u_batt" in samples.names
     assert "u_batt" not in network.features
+
+
+def test_lag_that_the_base_lacks_is_told_apart_from_what_a_network_can_learn(
+    flights, trained, samples
+) -> None:
+    quick = replace(flights[0].vehicle, motor_time_constant=0.0, command_delay=0.0)
+    misled = samples_of_flights([replace(f, vehicle=quick) for f in flights], rigid_body_model(quick))
+    shares = memory_share(samples, trained), memory_share(misled, train(misled, QUICK, (32, 32), seed=1))
+    assert shares[0] < 0.5 * MATERIAL_MEMORY
+    assert shares[1] > 2 * MATERIAL_MEMORY
+
+
+def test_flight_that_is_too_short_is_left_out_and_told_of(flights, base, samples) -> None:
+    short = replace(flights[2].part(slice(0, 300)), name="short")
+    both = samples_of_flights([flights[0], short], base)
+    assert len(both.left_out) == 1
+    assert len(both) == int((samples.flight == 0).sum())
+    with pytest.raises(InputError, match="too short"):
+        samples_of_flights([short], base)
+
+
+def test_samples_on_the_ground_are_not_learnt_from(flights, base) -> None:
+    height = flights[0].position.copy()
+    height[1000:1010, 2] = 0.0
+    touching = replace(flights[0], position=height)
+    whole, rest = (samples_of_flights([f], base) for f in (flights[0], touching))
+    touched = flights[0].t[1005] - flights[0].t[0]
+    near = [np.abs(s.t - touched) < 0.5 for s in (whole, rest)]
+    assert near[0].any()
+    assert not near[1].any()
 
 
 def test_training_range_is_that_of_the_flights_trained_on(trained, samples) -> None:

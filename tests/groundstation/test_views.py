@@ -251,5 +251,14 @@ def test_the_pilots_page_says_what_flies_and_when_the_vehicle_falls_silent(fligh
         assert word in page
     tick.guard = "tripped: outside the training range of vx"
     assert "**tripped: outside the training range of vx**" in state("quad5", tick, 0.0)
+    tick.shadow, tick.guard = "ba9876543210", "active, shadow"
+    status = {
+        "models": [{"hash": "0123456789ab", "name": "quad5", "version": "3"}],
+        "last_good": "aaaaaaaaaaaa",
+        "shadow": {"hash": "ba9876543210", "title": "ba9876543210 (quad5 4)", "remaining": 2.2},
+    }
+    page = state("quad5", tick, 0.0, status)
+    for word in ("`0123456789ab` quad5 3", "`ba9876543210` quad5 4", "to go | 2 s", "last good | `aaaaaaaaaaaa`"):
+        assert word in page
     assert "SILENT for 7 s" in state("quad5", tick, 7.2)
     assert "No tick has arrived" in state("quad5", None, 0.0)

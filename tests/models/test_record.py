@@ -80,6 +80,23 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert set(COLUMNS) - set(ticks) == {"motor_command", "position_reference"}
 
 
+def test_a_model_in_the_shadow_is_recorded_beside_the_live_one(tmp_path: Path) -> None:
+    with FlightRecorder(tmp_path / "a.mcap", VEHICLE) as recorder:
+        for i in range(4):
+            tick = make_tick(i)
+            tick.model = "0123456789ab"
+            if i > 1:
+                tick.shadow = "ba9876543210"
+                tick.shadow_raw.CopyFrom(Vector3(z=-1.5))
+            recorder.tick(tick, tick.vehicle_time_us, tick.host_time_ns)
+    ticks = read_record(tmp_path / "a.mcap").ticks
+    assert list(ticks["shadow"]) == ["", "", "ba9876543210", "ba9876543210"]
+    assert set(ticks["model"]) == {"0123456789ab"}
+    np.testing.assert_array_equal(ticks["shadow_raw"][:, 2], [np.nan, np.nan, -1.5, -1.5])
+    write(tmp_path / "old.mcap", 3)
+    assert "shadow_raw" not in read_record(tmp_path / "old.mcap").ticks, "as in records from before"
+
+
 def test_what_was_never_measured_is_absent_and_gaps_are_nan(tmp_path: Path) -> None:
     with FlightRecorder(tmp_path / "a.mcap", VEHICLE) as recorder:
         for i in range(3):
