@@ -296,6 +296,12 @@ def diagnose_command(
         Path | None,
         typer.Option("--save", "--rrd", help="Write a Rerun recording of the whole analysis here."),
     ] = None,
+    thrust: Annotated[
+        str,
+        typer.Option(
+            "--thrust", help="command, or rotors: thrust by rotor speeds, what is beyond them is judged."
+        ),
+    ] = "command",
     as_json: JsonOption = False,
 ) -> None:
     """Which effect is missing: ranked, with parameters and intervals, checked on held-out data.
@@ -308,6 +314,13 @@ def diagnose_command(
 
     read = _read(flight, vehicle, mapping)
     held_out = None if validate is None else _read(validate, vehicle or same_vehicle(read), mapping)
+    if thrust not in ("command", "rotors"):
+        raise InputError(f"--thrust {thrust}: choose command or rotors")
+    if thrust == "rotors":
+        from groundstation.rotors import thrust_from_rotors
+
+        read = thrust_from_rotors(read)
+        held_out = None if held_out is None else thrust_from_rotors(held_out)
     line = starting_line(model, read, store, effects)
     with nullcontext() if as_json else console.status("looking for missing effects") as status:
         progress = (lambda text: None) if status is None else status.update
@@ -413,6 +426,8 @@ def effects_command(
                         for p in e.parameters
                     },
                     "needs": list(e.needs),
+                    "needs_any": list(e.needs_any),
+                    "seen_in": "rotation" if e.rotational else "acceleration",
                     "manoeuvre": e.manoeuvre,
                     "confounded_with": list(e.confounded_with),
                     "citation": e.citation,
@@ -429,9 +444,10 @@ def effects_command(
         for p in e.parameters:
             unit = "" if p.unit == "1" else f" {p.unit}"
             console.print(f"  {p.name}: {p.meaning}, {p.low:g} to {p.high:g}{unit}")
-        console.print(f"needs: {', '.join(e.needs)}")
+        either = f"{', ' if e.needs else ''}{' or '.join(e.needs_any)}" if e.needs_any else ""
+        console.print(f"needs: {', '.join(e.needs)}{either}")
         console.print(f"fly: {e.manoeuvre}")
-        console.print(f"confounded with: {', '.join((*e.confounded_with, *e.aliases)) or 'nothing known'}")
+        console.print(f"confounded with: {', '.join((*e.confounded_with, *e.aliases)) or e.unconfounded}")
         console.print(f"source: {e.citation}")
         return
     table = Table()

@@ -8,6 +8,7 @@ from groundstation import (
     analysis_commands,
     bound_commands,
     collect_commands,
+    effect_commands,
     flight_commands,
     pilot_commands,
     report_commands,
@@ -32,6 +33,7 @@ bound_commands.register(app)
 train_commands.register(app)
 pilot_commands.register(app)
 collect_commands.register(app)
+effect_commands.register(app)
 reproduce_commands.register(app)
 
 
