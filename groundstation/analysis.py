@@ -162,9 +162,13 @@ def _roles(
 
 def steps_to(diagnosis: Diagnosis, bandwidth: float | None = None) -> list[Model]:
     """The models from the base to the diagnosed one, one more effect each, the most important first; what was found
-    before is fitted anew with each."""
+    before is fitted anew with each. Effects seen in the rotation alone change no acceleration and are no step."""
     base, last = diagnosis.base, diagnosis.model
-    ranked = [e.name for e in sorted(diagnosis.effects, key=lambda e: e.rank or 0) if e.rank]
+    ranked = [
+        e.name
+        for e in sorted(diagnosis.effects, key=lambda e: e.rank or 0)
+        if e.rank and e.seen_in != "rotation"
+    ]
     waiting = [n for n in ranked if n in last.names() and n not in base.names()]
     order: list[str] = []
     while waiting:
