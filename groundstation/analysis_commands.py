@@ -13,6 +13,8 @@ from rich.console import Console
 from models.errors import InputError
 
 if TYPE_CHECKING:
+    from groundstation.side_by_side import SideBySide
+    from models.design import Design
     from models.flight import Flight
     from models.model import Model
 
@@ -33,7 +35,11 @@ BandwidthOption = Annotated[
     float | None, typer.Option("--bandwidth", help="Low-pass for both sides, Hz.", min=0.1)
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
-RecordingOption = Annotated[Path | None, typer.Option("--rrd", help="Write a Rerun recording here.")]
+SaveOption = Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")]
+ModelsOption = Annotated[
+    list[str] | None,
+    typer.Option("--model", help="A version number, or a model's JSON file. Repeat to compare models."),
+]
 DEFAULT_STORE = Path("trueflight-models")
 
 
@@ -94,36 +100,53 @@ def check_vehicle(model: Model, flight: Flight) -> None:
 
 
 def compare_command(
-    flight: FlightArgument,
+    flights: Annotated[
+        list[Path],
+        typer.Argument(help="A flight, or several to compare: CSV, Parquet, MCAP record or PX4 ULog."),
+    ],
     vehicle: VehicleOption = None,
     mapping: MappingOption = None,
-    model: ModelOption = None,
+    model: ModelsOption = None,
     store: StoreOption = DEFAULT_STORE,
     effects: EffectsOption = None,
     bandwidth: BandwidthOption = None,
-    rrd: RecordingOption = None,
+    save: SaveOption = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write an HTML report of the comparison here.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Model against measurement: residual per axis, noise floor, share explained, open-loop error.
 
-    Shows the linear model, and every version that led to the newest (or to --model).
+    One flight: the linear model, and every version that led to the newest (or to --model). Several flights, or
+    --model repeated: side by side, over the same bins.
 
-    Example: groundstation compare identify.csv --vehicle vehicle.toml --rrd compare.rrd
+    Example: groundstation compare before.csv after.csv --save compare.rrd -o compare.html
     """
     from groundstation import as_json as tables_json
     from groundstation.compare import compare
     from groundstation.tables import print_comparisons, print_where
     from groundstation.where import where_it_fails
 
-    read = _read(flight, vehicle, mapping)
-    results = [
-        compare(read, m, bandwidth) for m in _versions(chosen_model(model, read, store, effects), store)
-    ]
+    if len(flights) > 1 or len(model or ()) > 1:
+        read = _read_all(flights, vehicle, mapping)
+        models = [
+            [chosen_model(which, flight, store, effects) for which in model or (None,)] for flight in read
+        ]
+        _compare_side_by_side(read, models, bandwidth, save, output, as_json)
+        return
+    flight = _read(flights[0], vehicle, mapping)
+    line = lineage_of(chosen_model((model or (None,))[0], flight, store, effects), store)
+    results = [compare(flight, m, bandwidth) for m in line]
     where = where_it_fails(results[-1])
-    if rrd is not None:
+    if save is not None:
         from groundstation.views import write_comparison
 
-        write_comparison(rrd, results, where)
+        write_comparison(save, results, where)
+    if output is not None:
+        from groundstation.side_by_side import side_by_side
+
+        _write_side_by_side_report(output, side_by_side([flight], [line], bandwidth))
     if as_json:
         last = tables_json.comparison_table(results[-1])
         print_json(
@@ -131,17 +154,90 @@ def compare_command(
                 **last,
                 "versions": [tables_json.comparison_table(c) for c in results],
                 "where": tables_json.where_table(where),
-                "recording": None if rrd is None else str(rrd),
+                "recording": None if save is None else str(save),
+                "report": None if output is None else str(output),
             }
         )
         return
     print_comparisons(console, results)
     print_where(console, where)
-    if rrd is not None:
-        console.print(f"Rerun recording: {rrd}")
+    print_written(save, output)
 
 
-def _versions(model: Model, store: Path) -> list[Model]:
+def _read_all(paths: list[Path], vehicle: Path | None, mapping: Path | None) -> list[Flight]:
+    """The flights, named apart; a flight without a vehicle file of its own has that of the first."""
+    from groundstation.side_by_side import told_apart
+
+    read = [_read(paths[0], vehicle, mapping)]
+    read += [read_other(path, vehicle, mapping, read[0]) for path in paths[1:]]
+    return told_apart(read)
+
+
+def read_other(path: Path, vehicle: Path | None, mapping: Path | None, first: Flight) -> Flight:
+    """Another flight, with the vehicle file beside it or else that of the first."""
+    try:
+        return _read(path, vehicle, mapping)
+    except InputError:
+        if vehicle is not None or (same := same_vehicle(first)) is None:
+            raise
+        return _read(path, same, mapping)
+
+
+def _compare_side_by_side(
+    flights: list[Flight],
+    models: list[list[Model]],
+    bandwidth: float | None,
+    save: Path | None,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    from groundstation.as_json import side_by_side_table
+    from groundstation.side_by_side import side_by_side
+    from groundstation.tables import print_side_by_side
+
+    with nullcontext() if as_json else console.status("comparing"):
+        beside = side_by_side(flights, models, bandwidth)
+        if save is not None:
+            from groundstation.views import write_side_by_side
+
+            write_side_by_side(save, beside)
+        made = None if output is None else _write_side_by_side_report(output, beside)
+    if as_json:
+        print_json(
+            {
+                **(made or {"side_by_side": side_by_side_table(beside)}),
+                "recording": None if save is None else str(save),
+                "report": None if output is None else str(output),
+            }
+        )
+        return
+    print_side_by_side(console, beside)
+    print_written(save, output)
+
+
+def _write_side_by_side_report(path: Path, beside: SideBySide) -> dict[str, Any]:
+    """Write the page; returns the JSON it was written from."""
+    from dataclasses import asdict
+
+    from groundstation.analysis import provenance
+    from groundstation.as_json import side_by_side_table
+    from groundstation.report import render_side_by_side, write_report
+
+    made = provenance(*(("flight", c.flight) for c in beside.comparisons))
+    table = {"side_by_side": side_by_side_table(beside), "provenance": asdict(made)}
+    write_report(path, render_side_by_side(beside, table))
+    return table
+
+
+def print_written(save: Path | None, output: Path | None) -> None:
+    """Say what was written, and where."""
+    if save is not None:
+        console.print(f"Rerun recording: {save}")
+    if output is not None:
+        console.print(f"report: {output}")
+
+
+def lineage_of(model: Model, store: Path) -> list[Model]:
     """The models from the linear one to `model`."""
     from groundstation.store import lineage
 
@@ -156,12 +252,12 @@ def where_command(
     store: StoreOption = DEFAULT_STORE,
     effects: EffectsOption = None,
     bandwidth: BandwidthOption = None,
-    rrd: RecordingOption = None,
+    save: SaveOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Where a model fails: the residual against height, speed, tilt, thrust, voltage, time and place.
 
-    Example: groundstation where identify.csv --vehicle vehicle.toml --rrd where.rrd
+    Example: groundstation where identify.csv --vehicle vehicle.toml --save where.rrd
     """
     from groundstation import as_json as tables_json
     from groundstation.compare import compare
@@ -171,16 +267,15 @@ def where_command(
     read = _read(flight, vehicle, mapping)
     result = compare(read, chosen_model(model, read, store, effects), bandwidth, horizons=False)
     where = where_it_fails(result)
-    if rrd is not None:
+    if save is not None:
         from groundstation.views import write_where
 
-        write_where(rrd, result, where)
+        write_where(save, result, where)
     if as_json:
         print_json({"model": result.label, "rms": result.rms, **tables_json.where_table(where)})
         return
     print_where(console, where)
-    if rrd is not None:
-        console.print(f"Rerun recording: {rrd}")
+    print_written(save, None)
 
 
 def diagnose_command(
@@ -197,39 +292,84 @@ def diagnose_command(
     everything: Annotated[
         bool, typer.Option("--all", help="Parameters of every effect, found or not.")
     ] = False,
+    save: Annotated[
+        Path | None,
+        typer.Option("--save", "--rrd", help="Write a Rerun recording of the whole analysis here."),
+    ] = None,
+    thrust: Annotated[
+        str,
+        typer.Option(
+            "--thrust", help="command, or rotors: thrust by rotor speeds, what is beyond them is judged."
+        ),
+    ] = "command",
     as_json: JsonOption = False,
 ) -> None:
     """Which effect is missing: ranked, with parameters and intervals, checked on held-out data.
 
-    Example: groundstation diagnose identify.csv --vehicle vehicle.toml --validate validate.csv --json
+    Example: groundstation diagnose identify.csv --vehicle vehicle.toml --validate validate.csv --save analysis.rrd
     """
-    from groundstation.as_json import diagnosis_table
+    from groundstation.as_json import analysis_table, diagnosis_table
     from groundstation.diagnosis import diagnose
     from groundstation.tables import print_diagnosis
 
     read = _read(flight, vehicle, mapping)
-    held_out = None if validate is None else _read(validate, vehicle or _same(read), mapping)
-    base = chosen_model(model, read, store, effects)
-    if "rigid_body" not in base.names():
-        from models.model import rigid_body_model
+    held_out = None if validate is None else _read(validate, vehicle or same_vehicle(read), mapping)
+    if thrust not in ("command", "rotors"):
+        raise InputError(f"--thrust {thrust}: choose command or rotors")
+    if thrust == "rotors":
+        from groundstation.rotors import thrust_from_rotors
 
+        read = thrust_from_rotors(read)
+        held_out = None if held_out is None else thrust_from_rotors(held_out)
+    line = starting_line(model, read, store, effects)
+    with nullcontext() if as_json else console.status("looking for missing effects") as status:
+        progress = (lambda text: None) if status is None else status.update
+        if save is None:
+            result = diagnose(read, line[-1], held_out, bandwidth, progress=progress)
+            table = diagnosis_table(result)
+        else:
+            from groundstation.analysis import analyse
+            from groundstation.views import write_analysis
+
+            whole = analyse(read, line, held_out, bandwidth, design_of(flight, None, read), progress=progress)
+            result, table = whole.diagnosis, {**analysis_table(whole), "recording": str(save)}
+            write_analysis(save, whole)
+    if as_json:
+        print_json(table)
+        return
+    print_diagnosis(console, result, everything)
+    print_written(save, None)
+
+
+def starting_line(which: str | None, flight: Flight, store: Path, effects: Path | None) -> list[Model]:
+    """The models that led to the one a diagnosis starts from, that one last; exact rotation is always in it."""
+    from models.model import rigid_body_model
+
+    base = chosen_model(which, flight, store, effects)
+    if "rigid_body" not in base.names():
         if base.network is not None:
             raise InputError(
                 f"the network of {base.label} was trained beside the linear model, and diagnosis starts from exact "
                 "rotation; pass --model with a version that has rigid_body, or --model linear"
             )
-        base = rigid_body_model(read.vehicle, base.effects_directory)
-    with nullcontext() if as_json else console.status("looking for missing effects") as status:
-        result = diagnose(
-            read, base, held_out, bandwidth, progress=(lambda text: None) if status is None else status.update
-        )
-    if as_json:
-        print_json(diagnosis_table(result))
-        return
-    print_diagnosis(console, result, everything)
+        base = rigid_body_model(flight.vehicle, base.effects_directory)
+    return lineage_of(base, store)
 
 
-def _same(flight: Flight) -> Path | None:
+def design_of(path: Path, design: Path | None, flight: Flight) -> Design | None:
+    """The design that a flight was flown by: the one given, else that of the record; None where there is none."""
+    from models.design import load_design
+
+    if design is not None:
+        return load_design(design, flight.vehicle)
+    if path.suffix.lower() == ".mcap":
+        from models.record import read_record
+
+        return read_record(path).design
+    return None
+
+
+def same_vehicle(flight: Flight) -> Path | None:
     """The vehicle file of the first flight also serves the second."""
     source = Path(flight.vehicle.source)
     return source if source.is_file() else None
@@ -286,6 +426,8 @@ def effects_command(
                         for p in e.parameters
                     },
                     "needs": list(e.needs),
+                    "needs_any": list(e.needs_any),
+                    "seen_in": "rotation" if e.rotational else "acceleration",
                     "manoeuvre": e.manoeuvre,
                     "confounded_with": list(e.confounded_with),
                     "citation": e.citation,
@@ -302,9 +444,10 @@ def effects_command(
         for p in e.parameters:
             unit = "" if p.unit == "1" else f" {p.unit}"
             console.print(f"  {p.name}: {p.meaning}, {p.low:g} to {p.high:g}{unit}")
-        console.print(f"needs: {', '.join(e.needs)}")
+        either = f"{', ' if e.needs else ''}{' or '.join(e.needs_any)}" if e.needs_any else ""
+        console.print(f"needs: {', '.join(e.needs)}{either}")
         console.print(f"fly: {e.manoeuvre}")
-        console.print(f"confounded with: {', '.join((*e.confounded_with, *e.aliases)) or 'nothing known'}")
+        console.print(f"confounded with: {', '.join((*e.confounded_with, *e.aliases)) or e.unconfounded}")
         console.print(f"source: {e.citation}")
         return
     table = Table()
@@ -333,7 +476,7 @@ def model_add(
     store: StoreOption = DEFAULT_STORE,
     effects: EffectsOption = None,
     bandwidth: BandwidthOption = None,
-    rrd: RecordingOption = None,
+    save: SaveOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Add an effect: refit, write a new model version, and show the error falling.
@@ -341,22 +484,25 @@ def model_add(
     Example: groundstation model add rotor_drag --flight identify.csv --validate validate.csv
     """
     from groundstation import as_json as tables_json
-    from groundstation.compare import waterfall
-    from groundstation.store import add_effect, lineage, save
+    from groundstation.compare import compare, waterfall
+    from groundstation.store import add_effect, lineage
+    from groundstation.store import save as save_version
     from groundstation.tables import print_waterfall
 
     read = _read(flight, vehicle, mapping)
-    held_out = None if validate is None else _read(validate, vehicle or _same(read), mapping)
+    held_out = None if validate is None else _read(validate, vehicle or same_vehicle(read), mapping)
     base = chosen_model(model, read, store, effects)
     with nullcontext() if as_json else console.status(f"fitting {effect}"):
         made = add_effect(base, effect, [read], bandwidth)
-    made, path = save(store, made, base if base.version else None)
+    made, path = save_version(store, made, base if base.version else None)
     line = lineage(store, made)
     steps = waterfall(read, held_out, line, bandwidth)
-    if rrd is not None:
+    if save is not None:
         from groundstation.views import write_before_after
 
-        write_before_after(rrd, [(m, read, held_out) for m in line], steps)
+        shown = read if held_out is None else held_out
+        before, after = (compare(shown, m, bandwidth, horizons=False) for m in (line[0], made))
+        write_before_after(save, before, after, steps)
     if as_json:
         print_json(
             {
@@ -364,7 +510,7 @@ def model_add(
                 "path": str(path),
                 "network_dropped": base.network is not None,
                 "waterfall": tables_json.waterfall_table(steps),
-                "recording": None if rrd is None else str(rrd),
+                "recording": None if save is None else str(save),
             }
         )
         return
@@ -380,8 +526,7 @@ def model_add(
         low, high = term.intervals[name]
         console.print(f"{effect} {name} = {value:.4g}  [{low:.4g}, {high:.4g}]")
     console.print(f"model version: {path}")
-    if rrd is not None:
-        console.print(f"Rerun recording: {rrd}")
+    print_written(save, None)
 
 
 @model_app.command("list")

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
+from models.effects import effect_named
 from models.model import Model
 from models.network import Network
+
+if TYPE_CHECKING:
+    from groundstation.analysis import Analysis
+    from groundstation.side_by_side import SideBySide
+    from groundstation.tracking import Tracking
 
 UNIT = "m/s^2"
 
@@ -58,6 +64,7 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
                 },
                 "indistinguishable_from": list(e.indistinguishable_from),
                 "advice": e.advice,
+                "seen_in": e.seen_in,
             }
             for e in d.effects
         ],
@@ -66,6 +73,8 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
         "left_out": d.left_out,
         "notes": list(d.flight.notes),
     }
+    if d.rotational is not None:
+        table["rotational_rms"] = {**asdict(d.rotational), "unit": "rad/s^2"}
     if d.validation_before is not None:
         table["validation_rms"] = {"before": d.validation_before, "after": d.validation_after, "unit": UNIT}
     return plain(table)
@@ -145,3 +154,74 @@ def network_summary(network: Network) -> dict[str, Any]:
 def waterfall_table(steps: tuple[WaterfallStep, ...]) -> list[dict[str, Any]]:
     """The JSON of a waterfall."""
     return plain([asdict(s) for s in steps])
+
+
+def side_by_side_table(s: SideBySide) -> dict[str, Any]:
+    """The JSON of comparisons side by side; the RMS of a map has one row a comparison."""
+    rows = [
+        {"name": name, "change": change, **comparison_table(c), **_regions(w)}
+        for name, change, c, w in zip(s.names, s.change, s.comparisons, s.where, strict=True)
+    ]
+    first = s.where[0]
+    maps = []
+    for m in first.maps:
+        all_ = [next((x for x in w.maps if x.variable == m.variable), None) for w in s.where]
+        maps.append(
+            {
+                "variable": m.variable,
+                "unit": m.unit,
+                "edges": m.edges,
+                "rms": [None if x is None else x.rms for x in all_],
+                "share_of_time": [None if x is None else x.share_of_time for x in all_],
+            }
+        )
+    flights = len({id(c.flight) for c in s.comparisons}) > 1
+    return plain({"of": "flights" if flights else "models", "rows": rows, "maps": maps})
+
+
+def _regions(w: WhereItFails) -> dict[str, Any]:
+    return {"regions": [asdict(r) for r in w.regions], "worst": [asdict(m) for m in w.worst]}
+
+
+def tracking_table(t: Tracking) -> dict[str, Any]:
+    """The JSON of how a flight was tracked."""
+    return plain(
+        {
+            "label": t.label,
+            "seconds": len(t.t) * t.flight.dt,
+            "mse": dict(zip("xyz", t.mse, strict=True)),
+            "unit": "m^2",
+            "mse_zeta": dict(zip(("roll", "pitch", "yaw"), t.mse_zeta, strict=True)),
+            "rms": t.rms,
+        }
+    )
+
+
+def analysis_table(a: Analysis) -> dict[str, Any]:
+    """The JSON of a whole analysis: that of its diagnosis, and all that report and recording show beside."""
+    d, flight = a.diagnosis, a.flight
+    table = {
+        **diagnosis_table(d),
+        "duration": flight.duration,
+        "rate": 1.0 / flight.dt,
+        "comparison": {
+            "first": a.first,
+            "models": [comparison_table(c) for c in a.comparisons],
+            "held_out": [comparison_table(c) for c in a.held_out],
+        },
+        "waterfall": waterfall_table(a.waterfall),
+        "where": where_table(a.where),
+        "where_left": where_table(a.where_left),
+        "tracking": None if a.tracking is None else tracking_table(a.tracking),
+        "reference": None
+        if a.reference is None
+        else {
+            "rms": dict(zip("xyz", a.reference.rms, strict=True)),
+            "seconds": a.reference.seconds,
+            "unit": "m",
+        },
+        "side_by_side": None if a.side_by_side is None else side_by_side_table(a.side_by_side),
+        "titles": {e.name: effect_named(e.name, d.base.effects_directory).title for e in d.effects},
+        "provenance": asdict(a.provenance),
+    }
+    return plain(table)

@@ -8,8 +8,10 @@ from groundstation import (
     analysis_commands,
     bound_commands,
     collect_commands,
+    effect_commands,
     flight_commands,
     pilot_commands,
+    report_commands,
     reproduce_commands,
     train_commands,
 )
@@ -26,10 +28,12 @@ app = typer.Typer(
 )
 flight_commands.register(app)
 analysis_commands.register(app)
+report_commands.register(app)
 bound_commands.register(app)
 train_commands.register(app)
 pilot_commands.register(app)
 collect_commands.register(app)
+effect_commands.register(app)
 reproduce_commands.register(app)
 
 

@@ -148,7 +148,10 @@ def _analyse(
     console: Console, folder: Path, vehicle: Vehicle, survey: Path, task: Path
 ) -> tuple[Model, Diagnosis, Comparison, Comparison, tuple[Path, ...]]:
     """Compare, see where, diagnose, add what is missing. Returns the last model and what was measured."""
-    from groundstation.views import write_before_after, write_comparison, write_where
+    from groundstation.analysis import analyse
+    from groundstation.as_json import analysis_table
+    from groundstation.report import render, write_report
+    from groundstation.views import write_analysis, write_before_after
 
     fitted, held_out = read_flight(survey), read_flight(task)
     base = rigid_body_model(vehicle)
@@ -175,10 +178,14 @@ def _analyse(
     steps = waterfall(fitted, held_out, line)
     print_waterfall(console, steps, fitted.name, held_out.name)
     after = compare(fitted, model)
-    recordings = tuple(folder / f"{n}.rrd" for n in ("comparison", "where", "before-after"))
-    write_comparison(recordings[0], [compare(fitted, m) for m in line], where_it_fails(after))
-    write_where(recordings[1], before, where)
-    write_before_after(recordings[2], [(m, fitted, held_out) for m in line], steps)
+    recordings = folder / "analysis.rrd", folder / "before-after.rrd"
+    whole = analyse(fitted, lineage(store, base), held_out)
+    write_analysis(recordings[0], whole)
+    first, last = (compare(held_out, m, horizons=False) for m in (line[0], model))
+    write_before_after(recordings[1], first, last, steps)
+    report = folder / "report.html"
+    write_report(report, render(whole, analysis_table(whole)))
+    console.print(f"report: {report}", highlight=False)
     return model, diagnosis, before, after, recordings
 
 

@@ -339,7 +339,7 @@ def track_command(
         Path | None, typer.Option("--design", help="Design file; default: that of the record.")
     ] = None,
     vehicle: VehicleOption = None,
-    rrd: Annotated[Path | None, typer.Option("--rrd", help="Write a Rerun recording here.")] = None,
+    rrd: Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Flights against the linear behaviour expected of them: mean squared error per axis, as in the paper."""

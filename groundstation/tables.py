@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
 from groundstation.results import Comparison, Diagnosis, EffectVerdict, WaterfallStep, WhereItFails
+from groundstation.side_by_side import SideBySide
 
 VERDICT_STYLE = {
     "missing": "bold red",
@@ -110,6 +112,12 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
     if d.validation_before is not None and d.validation_after is not None:
         line += f"; held-out flight {d.validation_before:.3f} -> {d.validation_after:.3f} m/s²"
     console.print(Text(line, style="bold"))
+    if d.rotational is not None:
+        r = d.rotational
+        console.print(
+            f"angular acceleration {r.before:.3f} -> {r.after:.3f} rad/s² (noise floor {r.noise_floor:.3f})",
+            highlight=False,
+        )
     if d.unexplained.verdict:
         console.print(
             f"Unexplained: {percent(d.unexplained.variance_share)} of what is left can be predicted but fits no known "
@@ -155,3 +163,31 @@ def print_waterfall(
     cells = ["noise floor", f"{steps[-1].noise_floor:.3f}"] + ([""] if held_out else [])
     table.add_row(*cells, Text("█" * round(24 * steps[-1].noise_floor / most), style="dim"), style="dim")
     console.print(table)
+
+
+def print_side_by_side(console: Console, beside: SideBySide) -> None:
+    """Residual per axis and open-loop error, one row a flight or model, and what each fails at."""
+    first = beside.comparisons[0]
+    table = Table(
+        title="measured minus predicted acceleration, RMS in m/s², heading frame, "
+        f"below {first.bandwidth:g} Hz",
+        title_justify="left",
+    )
+    table.add_column("", overflow="fold")
+    axes = [a.axis for a in first.axes]
+    for name in (*axes, "all", "change", "noise\nfloor", "position\nafter 1 s"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, c, change in zip(beside.names, beside.comparisons, beside.change, strict=True):
+        by_axis = {a.axis: f"{a.rms:.3f}" for a in c.axes}
+        table.add_row(
+            escape(name),
+            *(by_axis.get(axis, "") for axis in axes),
+            f"{c.rms:.3f}",
+            "" if c is first else f"{100 * change:+.0f} %",
+            f"{c.noise_floor:.3f}",
+            f"{100 * sum(x * x for x in c.horizons[-1].position) ** 0.5:.1f} cm" if c.horizons else "",
+        )
+    console.print(table)
+    for name, where in zip(beside.names, beside.where, strict=True):
+        told = where.regions[0].text if where.regions else "evenly, no region holds much more than its share"
+        console.print(f"[bold]{escape(name)}[/bold]: {escape(told)}", highlight=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from groundstation.results import Comparison, ErrorMap, Moment, PlaceMap, Region, WhereItFails
@@ -17,12 +19,16 @@ MOMENT = 1.0
 """s, length of a worst moment."""
 
 
-def where_it_fails(comparison: Comparison) -> WhereItFails:
-    """Maps, regions and worst moments of the squared residual over the used samples of `comparison`."""
+def where_it_fails(comparison: Comparison, bins: Mapping[str, np.ndarray] | None = None) -> WhereItFails:
+    """Maps, regions and worst moments of the squared residual over the used samples of `comparison`.
+
+    `bins` are edges by variable; without them each map spans what the flight covers.
+    """
     flight, used = comparison.flight, comparison.used
     error = np.nanmean(comparison.residual**2, axis=1)  # over the axes that are measured
     variables = _variables(flight)
-    maps = tuple(_map(name, unit, x[used], error[used]) for name, unit, x, _ in variables)
+    edges = bins or {}
+    maps = tuple(_map(name, unit, x[used], error[used], edges.get(name)) for name, unit, x, _ in variables)
     regions = [
         r for name, unit, x, words in variables if (r := _region(name, unit, x[used], error[used], words))
     ]
@@ -57,9 +63,22 @@ def _variables(flight: Flight) -> list[Variable]:
     return out
 
 
-def _map(name: str, unit: str, x: np.ndarray, error: np.ndarray) -> ErrorMap:
-    low, high = np.quantile(x, [0.002, 0.998])
-    edges = np.linspace(low, max(high, low + 1e-9), BINS + 1)
+def common_bins(places: Sequence[WhereItFails]) -> dict[str, np.ndarray]:
+    """Edges by variable that span the maps of all of `places`, so that they can be read side by side."""
+    edges: dict[str, list[np.ndarray]] = {}
+    for where in places:
+        for m in where.maps:
+            edges.setdefault(m.variable, []).append(m.edges)
+    return {
+        name: np.linspace(min(e[0] for e in all_), max(e[-1] for e in all_), BINS + 1)
+        for name, all_ in edges.items()
+    }
+
+
+def _map(name: str, unit: str, x: np.ndarray, error: np.ndarray, edges: np.ndarray | None) -> ErrorMap:
+    if edges is None:
+        low, high = np.quantile(x, [0.002, 0.998])
+        edges = np.linspace(low, max(high, low + 1e-9), BINS + 1)
     number = np.clip(np.digitize(x, edges) - 1, 0, BINS - 1)
     count = np.bincount(number, minlength=BINS)
     total = np.bincount(number, weights=error, minlength=BINS)

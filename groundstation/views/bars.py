@@ -16,14 +16,17 @@ WIDTH = 100.0
 
 
 def bar_groups(
-    stream: rr.RecordingStream, name: str, groups: Sequence[tuple[str, Colour, Sequence[float]]]
+    stream: rr.RecordingStream,
+    name: str,
+    groups: Sequence[tuple[str, Colour, Sequence[float]]],
+    root: str = "",
 ) -> rrb.BarChartView:
     """A chart with one bar of each group (name, colour, values) at 0, 1, 2...; returns its view.
 
-    The legend of a chart shows entity paths, so each group stands under its own name.
+    The legend of a chart shows entity paths, so each group stands under its own name, behind `root`.
     """
     width = 0.8 / len(groups)
-    paths = [group.replace(" ", "_") for group, _, _ in groups]
+    paths = [root + group.replace(" ", "_") for group, _, _ in groups]
     for number, (path, (_, colour, values)) in enumerate(zip(paths, groups, strict=True)):
         places = np.arange(len(values)) + width * (number - 0.5 * (len(groups) - 1))
         widths = np.full(len(values), 0.92 * width)

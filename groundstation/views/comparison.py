@@ -10,8 +10,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from groundstation.results import Comparison, WhereItFails
-from groundstation.views.colour import FLOOR, MEASURED, of_version
-from groundstation.views.recording import TIME, between, curve, recording, text
+from groundstation.views.colour import MEASURED, of_version
+from groundstation.views.error import error_curves, error_over_time
+from groundstation.views.recording import between, curve, page, recording, text
 
 AXES = ("forward", "left", "up")
 WINDOW = 15.0
@@ -26,78 +27,63 @@ def write_comparison(
     """Write the recording of model versions (the linear one first, the newest last) against one flight."""
     flight = comparisons[0].flight
     with recording(path, "comparison", f"{flight.name}: measured and predicted") as stream:
-        stream.send_blueprint(_blueprint(stream, comparisons, where))
+        stream.send_blueprint(page(comparison_panel(stream, comparisons, where)))
 
 
-def _blueprint(
-    stream: rr.RecordingStream, comparisons: Sequence[Comparison], where: WhereItFails | None
-) -> rrb.Blueprint:
+def comparison_panel(
+    stream: rr.RecordingStream,
+    comparisons: Sequence[Comparison],
+    where: WhereItFails | None,
+    root: str = "",
+    markdown: str | None = None,
+) -> rrb.Container:
+    """Measured and predicted acceleration per axis, the residual of each version, and the page of errors."""
     flight, count = comparisons[0].flight, len(comparisons)
     start = _window(flight.t, where)
+    drawn = _drawn(comparisons)
     shown = [axis for axis in range(3) if np.any(np.isfinite(comparisons[0].measured[:, axis]))]
+    flying = np.ones(len(flight), bool) if flight.flying is None else flight.flying
     panels = []
     for axis in shown:
         name = "xyz"[axis]
-        flying = np.ones(len(flight), bool) if flight.flying is None else flight.flying
+        at = f"{root}acceleration/{name}"
         measured = np.where(flying, comparisons[0].measured[:, axis], np.nan)
-        curve(stream, f"acceleration/{name}/measured", flight.t, measured, "measured", MEASURED, 3.0)
+        curve(stream, f"{at}/measured", flight.t, measured, "measured", MEASURED, 3.0)
         values = [measured]
-        for index, c in _drawn(comparisons):
+        for index, c in enumerate(comparisons):
             predicted = np.where(flying, c.predicted[:, axis], np.nan)
-            values.append(predicted)
-            curve(
-                stream,
-                f"acceleration/{name}/v{index}",
-                flight.t,
-                predicted,
-                c.label,
-                of_version(index, count),
-            )
+            if index in drawn:
+                values.append(predicted)
+            colour = of_version(index, count)
+            curve(stream, f"{at}/v{index}", flight.t, predicted, c.label, colour, visible=index in drawn)
         panels.append(
             rrb.TimeSeriesView(
-                origin=f"acceleration/{name}",
+                origin=at,
                 name=f"{name} ({AXES[axis]}) acceleration, m/s², below {comparisons[0].bandwidth:g} Hz",
                 axis_x=rrb.TimeAxis(view_range=between(start, min(start + WINDOW, float(flight.t[-1])))),
                 axis_y=rrb.ScalarAxis(range=_range(values, flight.t, start)),
                 plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=axis == shown[0]),
             )
         )
-    highest = 0.0
-    for index, c in _drawn(comparisons):
-        rolling = rolling_rms(c.residual, c.used, round(SMOOTHING / flight.dt))
-        highest = max(highest, float(np.nanmax(rolling, initial=0.0)))
-        curve(stream, f"residual/v{index}", flight.t, rolling, c.label, of_version(index, count), 2.0)
-    floor = np.full(2, comparisons[-1].noise_floor)
-    curve(stream, "residual/floor", flight.t[[0, -1]], floor, "noise floor", FLOOR)
-    residual = rrb.TimeSeriesView(
-        origin="residual",
-        name="residual over the whole flight, RMS over 1 s, m/s²",
-        axis_x=rrb.TimeAxis(view_range=between(float(flight.t[0]), float(flight.t[-1]))),
-        axis_y=rrb.ScalarAxis(range=(0.0, 1.1 * highest)),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
-    )
-    text(stream, "summary", _summary(comparisons))
-    right = (rrb.TextDocumentView(origin="summary", name="errors"), residual)
-    return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(*panels), rrb.Vertical(*right, row_shares=[1, 1]), column_shares=[3, 2]),
-        rrb.TimePanel(state="collapsed", timeline=TIME),
-        collapse_panels=True,
+    errors = [
+        (comparisons[k].label, error_over_time(comparisons[k], SMOOTHING), of_version(k, count))
+        for k in drawn
+    ]
+    name = f"residual over the whole flight, RMS over {SMOOTHING:g} s, m/s²"
+    residual = error_curves(stream, f"{root}residual", errors, name, () if where is None else where.worst)
+    text(stream, f"{root}errors", _summary(comparisons) if markdown is None else markdown)
+    right = (rrb.TextDocumentView(origin=f"{root}errors", name="errors"), residual)
+    return rrb.Horizontal(
+        rrb.Vertical(*panels),
+        rrb.Vertical(*right, row_shares=[1, 1]),
+        column_shares=[3, 2],
+        name="measured and predicted",
     )
 
 
-def rolling_rms(residual: np.ndarray, used: np.ndarray, width: int) -> np.ndarray:
-    """RMS (N,) per axis of a residual (N, 3) over `width` samples; nan where little of them counts."""
-    square = np.where(used, np.nanmean(np.where(used[:, None], residual, 0.0) ** 2, axis=1), 0.0)
-    window = np.ones(max(width, 1))
-    total, count = np.convolve(square, window, "same"), np.convolve(used.astype(float), window, "same")
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(count > 0.3 * len(window), np.sqrt(total / count), np.nan)
-
-
-def _drawn(comparisons: Sequence[Comparison]) -> list[tuple[int, Comparison]]:
-    """The first and the last two versions: more curves hide each other."""
-    chosen = sorted({0, max(0, len(comparisons) - 2), len(comparisons) - 1})
-    return [(index, comparisons[index]) for index in chosen]
+def _drawn(comparisons: Sequence[Comparison]) -> list[int]:
+    """The first and the last two versions: more curves hide each other, and are switched on in the legend."""
+    return sorted({0, max(0, len(comparisons) - 2), len(comparisons) - 1})
 
 
 def _window(t: np.ndarray, where: WhereItFails | None) -> float:

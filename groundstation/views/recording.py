@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from models.errors import InputError
 
@@ -29,7 +30,7 @@ def recording(path: Path, kind: str, name: str) -> Iterator[rr.RecordingStream]:
         partial.touch()
     except OSError as error:
         raise InputError(
-            f"{path}: cannot write the recording ({error.strerror}); choose another --rrd"
+            f"{path}: cannot write the recording ({error.strerror}); choose another --save"
         ) from None
     stream = rr.RecordingStream(f"trueflight {kind}")
     try:
@@ -63,10 +64,15 @@ def curve(
     name: str,
     color: tuple[int, int, int],
     width: float = 1.5,
+    visible: bool = True,
 ) -> None:
-    """A curve over flight time: `t` (N,) in s, `values` (N,); missing values interrupt it."""
+    """A curve over flight time: `t` (N,) in s, `values` (N,); missing values interrupt it.
+
+    One that is not `visible` stands in the legend, to be switched on there.
+    """
     step = thin(len(t))
-    stream.log(path, rr.SeriesLines(colors=[color], names=name, widths=[width]), static=True)
+    lines = rr.SeriesLines(colors=[color], names=name, widths=[width], visible_series=[visible])
+    stream.log(path, lines, static=True)
     stream.send_columns(
         path,
         indexes=[rr.TimeColumn(TIME, duration=np.asarray(t[step], dtype=float))],
@@ -77,3 +83,8 @@ def curve(
 def text(stream: rr.RecordingStream, path: str, markdown: str) -> None:
     """A page of text."""
     stream.log(path, rr.TextDocument(markdown, media_type="text/markdown"), static=True)
+
+
+def page(content: rrb.Container) -> rrb.Blueprint:
+    """A recording that opens on `content`, with the timeline folded in and no other panel in the way."""
+    return rrb.Blueprint(content, rrb.TimePanel(state="collapsed", timeline=TIME), collapse_panels=True)

@@ -13,64 +13,64 @@ from groundstation.tracking import Tracking, told_apart
 from groundstation.views import scene
 from groundstation.views.bars import bar_groups
 from groundstation.views.colour import EXPECTED, NEWEST, Colour, of_version
-from groundstation.views.recording import TIME, curve, recording, text
+from groundstation.views.recording import curve, page, recording, text
 
 
 def write_tracking(path: Path, tracked: Sequence[Tracking]) -> None:
     """Write the recording of flights (before first, after last) against their expected linear behaviour."""
     tracked = told_apart(tracked)
     with recording(path, "tracking", " and ".join(t.label for t in tracked)) as stream:
-        stream.send_blueprint(_blueprint(stream, tracked))
+        stream.send_blueprint(page(tracking_panel(stream, tracked)))
 
 
-def _blueprint(stream: rr.RecordingStream, tracked: Sequence[Tracking]) -> rrb.Blueprint:
+def tracking_panel(stream: rr.RecordingStream, tracked: Sequence[Tracking], root: str = "") -> rrb.Container:
+    """Flown and expected in space, the distance over time, errors per axis and the table of all."""
     count = len(tracked)
     positions = np.concatenate([t.position for t in tracked])
     size = scene.extent(positions)
-    stream.log("space", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stream.log(f"{root}space", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for index, t in enumerate(tracked):
         colour = of_version(index, count) if count > 1 else NEWEST
-        scene.log_line(stream, f"space/flight{index}", t.position, colour, 0.004 * size)
-        scene.log_line(stream, f"space/expected{index}", t.expected, EXPECTED, 0.003 * size)
-        clock = t.t - t.t[0]
+        scene.log_line(stream, f"{root}space/flight{index}", t.position, colour, 0.004 * size)
+        scene.log_line(stream, f"{root}space/expected{index}", t.expected, EXPECTED, 0.003 * size)
+        clock = t.t if count == 1 else t.t - t.t[0]
         miss = np.linalg.norm(t.position - t.expected, axis=1)
         gaps = np.concatenate([[False], np.diff(clock) > 0.2])
         miss = np.where(gaps, np.nan, miss)
-        curve(stream, f"distance/flight{index}", clock, 100 * miss, t.label, colour, 2.0)
+        curve(stream, f"{root}distance/flight{index}", clock, 100 * miss, t.label, colour, 2.0)
         for axis, name in enumerate("xyz"):
             error = 100 * np.where(gaps, np.nan, t.position[:, axis] - t.expected[:, axis])
-            curve(stream, f"error/{name}/flight{index}", clock, error, t.label, colour, 1.5)
+            curve(stream, f"{root}error/{name}/flight{index}", clock, error, t.label, colour, 1.5)
     space = rrb.Spatial3DView(
-        origin="space",
+        origin=f"{root}space",
         name="flown, and expected of the linear design (green)",
         eye_controls=scene.eye(positions),
         line_grid=scene.ground(),
     )
-    bars = bar_groups(stream, "mean squared error (cm²) of x, y, z (0, 1, 2)", _groups(tracked))
+    bars = bar_groups(stream, "mean squared error (cm²) of x, y, z (0, 1, 2)", _groups(tracked), root)
     distance = rrb.TimeSeriesView(
-        origin="distance",
+        origin=f"{root}distance",
         name="distance to the expected position, cm",
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
     )
     errors = [
         rrb.TimeSeriesView(
-            origin=f"error/{name}", name=f"error in {name}, cm", plot_legend=rrb.PlotLegend(visible=False)
+            origin=f"{root}error/{name}",
+            name=f"error in {name}, cm",
+            plot_legend=rrb.PlotLegend(visible=False),
         )
         for name in "xyz"
     ]
-    text(stream, "summary", _summary(tracked))
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(space, distance, row_shares=[3, 2]),
-            rrb.Vertical(
-                rrb.Horizontal(rrb.TextDocumentView(origin="summary", name="tracking"), bars),
-                *errors,
-                row_shares=[3, 1.4, 1.4, 1.4],
-            ),
-            column_shares=[1, 1],
+    text(stream, f"{root}tracked", _summary(tracked))
+    return rrb.Horizontal(
+        rrb.Vertical(space, distance, row_shares=[3, 2]),
+        rrb.Vertical(
+            rrb.Horizontal(rrb.TextDocumentView(origin=f"{root}tracked", name="tracking"), bars),
+            *errors,
+            row_shares=[3, 1.4, 1.4, 1.4],
         ),
-        rrb.TimePanel(state="collapsed", timeline=TIME),
-        collapse_panels=True,
+        column_shares=[1, 1],
+        name="tracking",
     )
 
 

@@ -8,15 +8,19 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.results import Comparison, ErrorMap, WhereItFails
+from groundstation.results import Comparison, ErrorMap, PlaceMap, WhereItFails
 from groundstation.views import scene
-from groundstation.views.bars import legend
-from groundstation.views.colour import FLOOR, NEWEST, WARNING
-from groundstation.views.comparison import rolling_rms
-from groundstation.views.recording import TIME, between, curve, recording, text
+from groundstation.views.colour import FLOOR, NEWEST, REFERENCE, of_error
+from groundstation.views.error import (
+    ErrorOverTime,
+    error_curves,
+    error_legend,
+    error_over_time,
+    error_path,
+    moments_log,
+)
+from groundstation.views.recording import page, recording, text, thin
 
-MARKED = 3
-"""Worst moments that are marked in space."""
 MAPS = 6
 SMOOTHING = 0.3  # s
 
@@ -24,102 +28,85 @@ SMOOTHING = 0.3  # s
 def write_where(path: Path, comparison: Comparison, where: WhereItFails) -> None:
     """Write the recording of where `comparison` fails."""
     with recording(path, "where", f"{comparison.flight.name}: where {comparison.label} fails") as stream:
-        stream.send_blueprint(_blueprint(stream, comparison, where))
+        stream.send_blueprint(page(where_panel(stream, comparison, where)))
 
 
-def _blueprint(stream: rr.RecordingStream, comparison: Comparison, where: WhereItFails) -> rrb.Blueprint:
-    flight = comparison.flight
-    error = rolling_rms(comparison.residual, comparison.used, round(SMOOTHING / flight.dt))
-    finite = error[np.isfinite(error)]
-    highest = float(np.quantile(finite, 0.99)) if finite.size else 1.0
-    left: list[rrb.View] = []
+def where_panel(
+    stream: rr.RecordingStream,
+    comparison: Comparison,
+    where: WhereItFails,
+    left: tuple[str, WhereItFails] | None = None,
+    root: str = "",
+) -> rrb.Container:
+    """Path, residual over time and worst moments beside the maps of the error.
+
+    `left` (label, where) is what another model leaves in the same bins: a second bar in every map.
+    """
+    error = error_over_time(comparison, SMOOTHING)
+    views: list[rrb.View] = []
     shares: list[float] = []
-    if flight.position is not None:
-        left += [_space(stream, comparison, where, error, highest)]
-        left += [
-            legend(
-                stream, "legend", highest, "m/s²", f"residual of {comparison.label}, RMS over {SMOOTHING:g} s"
-            )
-        ]
-        shares += [8.0, 1.3]
-    curve(stream, "over_time/residual", flight.t, error, comparison.label, NEWEST, 1.5)
-    floor = np.full(2, comparison.noise_floor)
-    curve(stream, "over_time/floor", flight.t[[0, -1]], floor, "noise floor", FLOOR)
-    _mark_worst(stream, where, highest)
-    left.append(
-        rrb.TimeSeriesView(
-            origin="over_time",
-            name="residual over time, m/s² (worst moments marked)",
-            axis_x=rrb.TimeAxis(view_range=between(float(flight.t[0]), float(flight.t[-1]))),
-            axis_y=rrb.ScalarAxis(range=(0.0, 1.1 * float(finite.max(initial=0.1)))),
-            plot_legend=rrb.PlotLegend(visible=False),
+    name = f"path, coloured by the residual of {comparison.label}"
+    space = error_path(stream, f"{root}space", error, name, where.worst, vehicle=True)
+    if space is not None:
+        views += [space, error_legend(stream, f"{root}legend", error, f"residual of {comparison.label}")]
+        shares += [7.0, 1.2]
+    views.append(
+        error_curves(
+            stream,
+            f"{root}over_time",
+            [(comparison.label, error, NEWEST)],
+            "residual over time, m/s² (worst moments marked)",
+            where.worst,
         )
     )
     shares.append(3.0)
-    text(stream, "regions", _regions(comparison, where))
-    maps = [_map(stream, m) for m in where.maps if m.variable != "time"][:MAPS]
+    if where.worst:
+        views.append(
+            moments_log(stream, f"{root}moments", where.worst, "worst moments (click on a time to go there)")
+        )
+        shares.append(2.3)
+    text(stream, f"{root}regions", _regions(comparison, where, left))
+    maps: list[rrb.View] = [
+        _map(stream, m, None if left is None else left[1], f"{root}maps")
+        for m in where.maps
+        if m.variable != "time"
+    ][:MAPS]
+    told: rrb.View | rrb.Container = rrb.TextDocumentView(
+        origin=f"{root}regions", name="where the error sits"
+    )
+    if where.place is not None and space is not None:
+        place = _place(stream, where.place, error, f"{root}place")
+        told = rrb.Horizontal(told, place, column_shares=[3, 2])
     rows = [rrb.Horizontal(*maps[k : k + 2]) for k in range(0, len(maps), 2)]
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(*left, row_shares=shares),
-            rrb.Vertical(
-                rrb.TextDocumentView(origin="regions", name="where the error sits"),
-                *rows,
-                row_shares=[1.8, *[1.0] * len(rows)],
-            ),
-            column_shares=[1, 1],
+    return rrb.Horizontal(
+        rrb.Vertical(*views, row_shares=shares),
+        rrb.Vertical(
+            told,
+            *rows,
+            row_shares=[1.5, *[1.0] * len(rows)],
         ),
-        rrb.TimePanel(state="collapsed", timeline=TIME),
-        collapse_panels=True,
+        column_shares=[1, 1],
+        name="where it fails",
     )
 
 
-def _space(
-    stream: rr.RecordingStream, comparison: Comparison, where: WhereItFails, error: np.ndarray, highest: float
-) -> rrb.Spatial3DView:
-    flight = comparison.flight
-    position = flight.position
-    assert position is not None
-    flown = np.isfinite(error)
-    size = scene.extent(position[flown])
-    stream.log("space", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    scene.log_error_line(stream, "space/path", position, error, highest, 0.004 * size)
-    scene.log_vehicle(stream, "space/vehicle", flight.vehicle, size)
-    if flight.quaternion is not None:
-        scene.log_motion(stream, "space/vehicle", flight.t, position, flight.quaternion)
-    if where.worst:
-        middles = [0.5 * (m.start + m.end) for m in where.worst[:MARKED]]
-        places = np.stack([np.interp(middles, flight.t, axis) for axis in position.T], -1)
-        labels = [f"{m.rms:.2f} m/s² at {m.start:.1f} s" for m in where.worst[:MARKED]]
+def _map(
+    stream: rr.RecordingStream, error_map: ErrorMap, left: WhereItFails | None, root: str
+) -> rrb.BarChartView:
+    path = f"{root}/{error_map.variable.replace(' ', '_')}"
+    middle = 0.5 * (error_map.edges[1:] + error_map.edges[:-1])
+    width = np.diff(error_map.edges)
+    rest = None if left is None else next((m for m in left.maps if m.variable == error_map.variable), None)
+    bars = [("before", error_map.rms, NEWEST)] + ([] if rest is None else [("left", rest.rms, REFERENCE)])
+    for number, (name, rms, colour) in enumerate(bars):
+        share = 0.92 / len(bars)
+        places = middle + width * share * (number - 0.5 * (len(bars) - 1))
+        values = np.nan_to_num(np.asarray(rms, dtype=float))
         stream.log(
-            "space/worst",
-            rr.Points3D(
-                places, labels=labels, radii=0.012 * size, colors=[(255, 255, 255)], show_labels=True
-            ),
+            f"{path}/{name}",
+            rr.BarChart(values, abscissa=places, widths=share * width, color=colour),
             static=True,
         )
-    return rrb.Spatial3DView(
-        origin="space",
-        name="path, coloured by the residual",
-        eye_controls=scene.eye(position[flown]),
-        line_grid=scene.ground(),
-    )
-
-
-def _mark_worst(stream: rr.RecordingStream, where: WhereItFails, highest: float) -> None:
-    """Each worst stretch as a bar of its RMS over the time axis."""
-    for number, moment in enumerate(where.worst):
-        t = np.array([moment.start, moment.end])
-        name = "worst moments" if number == 0 else f"worst {number + 1}"
-        curve(stream, f"over_time/worst/{number}", t, np.full(2, moment.rms), name, WARNING, 5.0)
-
-
-def _map(stream: rr.RecordingStream, error_map: ErrorMap) -> rrb.BarChartView:
-    path = f"maps/{error_map.variable.replace(' ', '_')}"
-    edges = error_map.edges
-    middle, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
-    values = np.nan_to_num(error_map.rms)
-    stream.log(path, rr.BarChart(values, abscissa=middle, widths=0.92 * width, color=NEWEST), static=True)
     unit = "" if error_map.unit == "1" else f" ({error_map.unit})"
     return rrb.BarChartView(
         origin=path,
@@ -128,7 +115,35 @@ def _map(stream: rr.RecordingStream, error_map: ErrorMap) -> rrb.BarChartView:
     )
 
 
-def _regions(comparison: Comparison, where: WhereItFails) -> str:
+def _place(stream: rr.RecordingStream, place: PlaceMap, error: ErrorOverTime, root: str) -> rrb.Spatial3DView:
+    """The error over the ground, seen from above, the path in grey over it."""
+    centres = np.column_stack([place.centres, np.zeros(len(place.centres))])
+    half = np.full((len(centres), 3), [0.5 * place.cell, 0.5 * place.cell, 0.002])
+    colours = of_error(np.asarray(place.rms, dtype=float), error.highest)
+    stream.log(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stream.log(
+        f"{root}/cells",
+        rr.Boxes3D(centers=centres, half_sizes=half, colors=colours, fill_mode="solid"),
+        static=True,
+    )
+    position = error.comparison.flight.position
+    assert position is not None
+    flown = position[np.isfinite(error.values)]
+    line = flown[thin(len(flown), scene.PATH_POINTS)]
+    low, high = centres.min(axis=0), centres.max(axis=0)
+    middle = 0.5 * (low + high)
+    size = max(1.0, float(np.max(high - low)))
+    stream.log(f"{root}/path", rr.LineStrips3D([line], colors=[FLOOR], radii=0.002 * size), static=True)
+    return rrb.Spatial3DView(
+        origin=root,
+        name=f"over the ground, cells of {place.cell:g} m, north up",
+        eye_controls=rrb.EyeControls3D(
+            position=middle + [0.0, -0.01 * size, 1.25 * size], look_target=middle, eye_up=[0.0, 1.0, 0.0]
+        ),
+    )
+
+
+def _regions(comparison: Comparison, where: WhereItFails, left: tuple[str, WhereItFails] | None) -> str:
     head = f"**{comparison.label}: {comparison.rms:.3f} m/s²**, noise floor {comparison.noise_floor:.3f} m/s²"
     lines = [head, ""]
     if where.regions:
@@ -137,8 +152,6 @@ def _regions(comparison: Comparison, where: WhereItFails) -> str:
         ]
     else:
         lines.append("The error is spread over the flight: no part of it holds much more than its share.")
-    lines += ["", "Worst moments:", ""]
-    lines += [
-        f"- {m.start:.1f} to {m.end:.1f} s, **{m.rms:.2f} m/s²**: {m.text}" for m in where.worst[:MARKED]
-    ]
+    if left is not None:
+        lines += ["", f"Bars: blue {comparison.label}, green what {left[0]} leaves."]
     return "\n".join(lines)

@@ -19,7 +19,7 @@ from groundstation.store import add_effect
 from groundstation.tracking import Tracking
 from groundstation.views import write_before_after, write_comparison, write_tracking, write_where
 from groundstation.views.colour import of_error
-from groundstation.views.comparison import rolling_rms
+from groundstation.views.error import rolling_rms
 from groundstation.views.monitor import Monitor, state
 from groundstation.where import where_it_fails
 from models.errors import InputError
@@ -68,8 +68,8 @@ def write_all(folder, flights, versions):
     comparisons = [compare(fitted, model) for model in versions]
     write_comparison(folder / "comparison.rrd", comparisons, where_it_fails(comparisons[0]))
     write_where(folder / "where.rrd", comparisons[1], where_it_fails(comparisons[1]))
-    lines = [(model, fitted, held_out) for model in versions]
-    write_before_after(folder / "before_after.rrd", lines, waterfall(fitted, held_out, versions))
+    first, last = (compare(held_out, model, horizons=False) for model in (versions[0], versions[-1]))
+    write_before_after(folder / "before_after.rrd", first, last, waterfall(fitted, held_out, versions))
     write_tracking(folder / "tracking.rrd", [a_tracking(fitted), a_tracking(held_out)])
     with_monitor(folder / "monitor.rrd", fitted)
 
@@ -194,7 +194,7 @@ def test_where_it_fails_is_drawn_in_the_colours_of_the_error(recordings, environ
 
 def test_a_recording_that_cannot_be_written_is_told(flights, versions):
     comparison = compare(flights[1], versions[1], horizons=False)
-    with pytest.raises(InputError, match=r"cannot write the recording.*choose another --rrd"):
+    with pytest.raises(InputError, match=r"cannot write the recording.*choose another --save"):
         write_where(Path("/proc/none/where.rrd"), comparison, where_it_fails(comparison))
 
 

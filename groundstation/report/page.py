@@ -1,0 +1,139 @@
+"""The page, section by section; each stands alone and can be left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from groundstation.analysis import Analysis
+from groundstation.report import charts
+from groundstation.report.svg import style
+from groundstation.report.told import Told, environment, sentences
+from groundstation.side_by_side import SideBySide
+from models.errors import InputError
+
+Table = dict[str, Any]
+Charts = dict[str, Markup | None]
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of the page: `template` is its file under templates/sections, `charts` draws what it shows; it is left
+    out where the table has nothing under one of `needs`."""
+
+    name: str
+    title: str
+    charts: Callable[[Analysis, Table], Charts]
+    needs: tuple[str, ...] = ()
+
+    @property
+    def template(self) -> str:
+        """Its file."""
+        return f"sections/{self.name}.html"
+
+
+def _none(a: Analysis, table: Table) -> Charts:
+    return {}
+
+
+SECTIONS: tuple[Section, ...] = (
+    Section("ranking", "Which effect is missing", _none),
+    Section("waterfall", "The error as effects are added", lambda a, t: {"bars": charts.waterfall(t)}),
+    Section(
+        "prediction",
+        "Measured and predicted",
+        lambda a, t: {"window": charts.prediction(a), "over_time": charts.over_time(a)},
+    ),
+    Section(
+        "where",
+        "Where it fails",
+        lambda a, t: {"path": charts.path(a), "maps": charts.maps(t), "place": charts.place(a, t)},
+    ),
+    Section("worst", "Worst moments", _none),
+    Section(
+        "tracking",
+        "Tracking",
+        lambda a, t: {"errors": None if a.tracking is None else charts.tracking(a.tracking)},
+        ("reference",),
+    ),
+    Section(
+        "side_by_side",
+        "Side by side",
+        lambda a, t: _beside(a.side_by_side, t),
+        ("side_by_side",),
+    ),
+    Section("blind", "What these data cannot tell", _none),
+    Section("provenance", "How this was made", _none, ("provenance",)),
+)
+
+
+def _beside(beside: SideBySide | None, table: Table) -> Charts:
+    if beside is None:
+        return {}
+    return {"maps": charts.beside_maps(table), "over_time": charts.beside_over_time(beside)}
+
+
+def chosen(without: Sequence[str]) -> tuple[Section, ...]:
+    """The sections but those named; raises `InputError` for a name that is none."""
+    names = [s.name for s in SECTIONS]
+    for name in without:
+        if name not in names:
+            raise InputError(f"--without {name}: no such section; there are: {', '.join(names)}")
+    return tuple(s for s in SECTIONS if s.name not in without)
+
+
+def render(analysis: Analysis, table: Table, sections: Sequence[Section] = SECTIONS) -> str:
+    """The page as HTML. `table` is the JSON of `analysis`: every number in the page is read from it."""
+    html, told = environment(html=True), Told(table)
+    with style():
+        bodies = [
+            (section, _body(html, section, section.charts(analysis, table), told))
+            for section in sections
+            if all(table.get(need) for need in section.needs)
+        ]
+    return html.get_template("report.html").render(
+        t=told,
+        verdict=sentences(table, html=True),
+        title=f"{table['flight']}: what is missing",
+        sections=bodies,
+    )
+
+
+def render_side_by_side(beside: SideBySide, table: Table) -> str:
+    """A page of comparisons side by side alone; `table` holds their JSON under "side_by_side", and
+    "provenance"."""
+    html, told = environment(html=True), Told(table)
+    wanted = {s.name: s for s in SECTIONS}
+    with style():
+        drawn = _beside(beside, table)
+    bodies = [
+        (wanted["side_by_side"], _body(html, wanted["side_by_side"], drawn, told)),
+        (wanted["provenance"], _body(html, wanted["provenance"], {}, told)),
+    ]
+    lines = html.get_template("beside.txt").render(t=told).splitlines()
+    verdict = [Markup(" ".join(line.split())) for line in lines if line.strip()]
+    title = " and ".join(beside.names)
+    return html.get_template("report.html").render(t=told, verdict=verdict, title=title, sections=bodies)
+
+
+def _body(html: Any, section: Section, drawn: Charts, told: Told) -> Markup:
+    return Markup(html.get_template(section.template).render(t=told, chart=drawn))
+
+
+def write_report(path: Path, text: str) -> None:
+    """Write a page whole or not at all. Raises `InputError` where it cannot be written."""
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot write the report ({error.strerror}); choose another --output"
+        ) from None
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,99 @@
+"""Figures of matplotlib as inline SVG in the colours of the page, so that they follow its light and dark."""
+
+from __future__ import annotations
+
+import io
+import re
+from contextlib import AbstractContextManager
+
+import matplotlib
+import numpy as np
+from markupsafe import Markup, escape
+from matplotlib.figure import Figure
+
+COLOURS = {
+    # stand-ins that the page's stylesheet gives a value, in light and in dark
+    name: f"#00{number:02x}01"
+    for number, name in enumerate(
+        ("ink", "muted", "grid", "measured", "linear", "before", "after", "held", "floor", "worst"), 1
+    )
+}
+LEVELS = 8
+"""Steps of the error's scale."""
+ERROR = tuple(f"#00{number:02x}02" for number in range(LEVELS))
+BESIDE = tuple(f"#00{number:02x}03" for number in range(6))
+"""What is compared side by side."""
+
+STYLE = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "trueflight",
+    "font.family": "sans-serif",
+    "font.size": 8.5,
+    "text.color": COLOURS["ink"],
+    "axes.edgecolor": COLOURS["muted"],
+    "axes.labelcolor": COLOURS["ink"],
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": COLOURS["grid"],
+    "grid.linewidth": 0.6,
+    "xtick.color": COLOURS["muted"],
+    "ytick.color": COLOURS["muted"],
+    "xtick.labelcolor": COLOURS["ink"],
+    "ytick.labelcolor": COLOURS["ink"],
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "path.simplify": True,
+    "path.simplify_threshold": 0.5,
+}
+
+
+def figure(
+    rows: int, columns: int, width: float, height: float, sharex: bool = False
+) -> tuple[Figure, np.ndarray]:
+    """A figure of `width` by `height` inches with its axes (rows, columns)."""
+    made = Figure(figsize=(width, height), layout="constrained", facecolor="none")
+    axes = made.subplots(rows, columns, squeeze=False, sharex=sharex)
+    for one in axes.flat:
+        one.set_facecolor("none")
+    return made, axes
+
+
+def style() -> AbstractContextManager[None]:
+    """While it holds, figures are drawn in the style of the page."""
+    return matplotlib.rc_context(STYLE)
+
+
+def to_svg(made: Figure, name: str, alt: str) -> Markup:
+    """The figure as one inline element; `alt` says in words what it shows."""
+    out = io.StringIO()
+    made.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
+    text = out.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    # one page holds many figures: their names must not meet
+    text = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', text)
+    text = re.sub(r'xlink:href="#([^"]+)"', rf'href="#{name}-\1"', text)
+    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", text)
+    for key, colour in (
+        *COLOURS.items(),
+        *((f"e{k}", c) for k, c in enumerate(ERROR)),
+        *((f"s{k}", c) for k, c in enumerate(BESIDE)),
+    ):
+        text = text.replace(colour, f"var(--{key})")
+    box = re.search(r'viewBox="([^"]+)"', text)
+    assert box is not None
+    head = (
+        f'<svg class="chart" viewBox="{box[1]}" role="img" aria-label="{escape(alt)}" '
+        f'xmlns="http://www.w3.org/2000/svg">'
+    )
+    return Markup(head + f"<title>{escape(alt)}</title>" + text[text.index(">") + 1 :])
+
+
+def level(values: np.ndarray, highest: float) -> np.ndarray:
+    """Step (N,) of the error's scale, 0 to 7; -1 where there is no value."""
+    place = np.clip(np.nan_to_num(values) / max(highest, 1e-12) * LEVELS, 0, LEVELS - 1).astype(int)
+    return np.where(np.isfinite(values), place, -1)

@@ -1,0 +1,113 @@
+"""Flights, or models, side by side: the error over the same bins and the same clock, and the paths."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from groundstation.report.told import written
+from groundstation.side_by_side import SideBySide
+from groundstation.views.colour import AXES, BETWEEN, LINEAR, NEWEST, REFERENCE, Colour
+from groundstation.views.error import error_curves, error_legend, error_over_time, error_path
+from groundstation.views.recording import page, recording, text
+
+COLOURS: tuple[Colour, ...] = (LINEAR, NEWEST, REFERENCE, *BETWEEN, *AXES)
+SMOOTHING = 0.5  # s
+PATHS = 4
+MAPS = 6
+
+
+def write_side_by_side(path: Path, beside: SideBySide) -> None:
+    """Write the recording of comparisons side by side."""
+    with recording(path, "side by side", " and ".join(beside.names)) as stream:
+        stream.send_blueprint(page(side_by_side_panel(stream, beside)))
+
+
+def side_by_side_panel(stream: rr.RecordingStream, beside: SideBySide, root: str = "") -> rrb.Container:
+    """The paths in one scale of colours, residuals over time from the start of each flight, and the maps."""
+    first = error_over_time(beside.comparisons[0], SMOOTHING)
+    errors = [first] + [error_over_time(c, SMOOTHING, first.highest) for c in beside.comparisons[1:]]
+    spaces = [
+        error_path(stream, f"{root}space{k}", error, f"{beside.names[k]}: {error.comparison.rms:.3f} m/s²",
+                   distance=1.0)
+        for k, error in enumerate(errors[:PATHS])
+    ]  # fmt: skip
+    views: list[rrb.View | rrb.Container] = [v for v in spaces if v is not None]
+    left: list[rrb.View | rrb.Container] = []
+    shares: list[float] = []
+    if views:
+        rows = [rrb.Horizontal(*views[k : k + 2]) for k in range(0, len(views), 2)]
+        left += [*rows, error_legend(stream, f"{root}scale", first, "residual on every path")]
+        shares += [4.0] * len(rows) + [1.0]
+    one_clock = len({id(c.flight) for c in beside.comparisons}) > 1
+    named = [(beside.names[k], e, COLOURS[k % len(COLOURS)]) for k, e in enumerate(errors)]
+    start = " from the start of each flight" if one_clock else ""
+    left.append(
+        error_curves(
+            stream,
+            f"{root}over_time",
+            named,
+            f"residual, RMS over {SMOOTHING:g} s, m/s²{start}",
+            clock=0.0 if one_clock else None,
+        )
+    )
+    shares.append(3.0)
+    text(stream, f"{root}table", _table(beside))
+    maps = [
+        _map(stream, beside, variable, f"{root}maps")
+        for variable in [m.variable for m in beside.where[0].maps if m.variable != "time"][:MAPS]
+    ]
+    pairs = [rrb.Horizontal(*maps[k : k + 2]) for k in range(0, len(maps), 2)]
+    return rrb.Horizontal(
+        rrb.Vertical(*left, row_shares=shares),
+        rrb.Vertical(
+            rrb.TextDocumentView(origin=f"{root}table", name="side by side"),
+            *pairs,
+            row_shares=[1.6, *[1.0] * len(pairs)],
+        ),
+        column_shares=[1, 1],
+        name="side by side",
+    )
+
+
+def _map(stream: rr.RecordingStream, beside: SideBySide, variable: str, root: str) -> rrb.BarChartView:
+    path, unit = f"{root}/{variable.replace(' ', '_')}", ""
+    count = len(beside.where)
+    for k, where in enumerate(beside.where):
+        m = next((m for m in where.maps if m.variable == variable), None)
+        if m is None:
+            continue
+        unit = "" if m.unit == "1" else f" ({m.unit})"
+        width = np.diff(m.edges)
+        middle = 0.5 * (m.edges[1:] + m.edges[:-1]) + width * 0.92 / count * (k - 0.5 * (count - 1))
+        bars = rr.BarChart(
+            np.nan_to_num(np.asarray(m.rms, dtype=float)),
+            abscissa=middle,
+            widths=0.92 * width / count,
+            color=COLOURS[k % len(COLOURS)],
+        )
+        stream.log(f"{path}/{k}", bars, static=True)
+    return rrb.BarChartView(
+        origin=path, name=f"RMS (m/s²) over {variable}{unit}", plot_legend=rrb.PlotLegend(visible=False)
+    )
+
+
+def _table(beside: SideBySide) -> str:
+    axes = [a.axis for a in beside.comparisons[0].axes]
+    lines = [
+        "| residual RMS, m/s² | " + " | ".join(axes) + " | all | noise floor | change |",
+        "|---|" + "---|" * (len(axes) + 3),
+    ]
+    for name, c, change in zip(beside.names, beside.comparisons, beside.change, strict=True):
+        cells = [f"{a.rms:.3f}" for a in c.axes]
+        told = "" if c is beside.comparisons[0] else written(change, "change")
+        lines.append(
+            f"| {name} | " + " | ".join(cells) + f" | **{c.rms:.3f}** | {c.noise_floor:.3f} | {told} |"
+        )
+    for name, where in zip(beside.names, beside.where, strict=True):
+        if where.regions:
+            lines += ["", f"**{name}**: {where.regions[0].text}"]
+    return "\n".join(lines)
