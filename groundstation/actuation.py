@@ -76,6 +76,43 @@ def fit_rate_loop(flights: Sequence[Flight]) -> RateLoop | None:
     return RateLoop(delay, lag, integral, unexplained, seconds)
 
 
+def rate_loop_sensitivity(flight: Flight, loop: RateLoop) -> tuple[np.ndarray, float]:
+    """Covariance (3, 3) of lag, delay and integral of `loop` as `flight` shows it, and its factor for 95 %.
+
+    Newey-West over `groundstation.fitting.HAC_LAG` s, for the residual of rates is far from white.
+    """
+    from scipy import signal
+    from statsmodels.stats.sandwich_covariance import S_hac_simple
+
+    from groundstation.fitting import HAC_LAG, critical_value
+
+    bread, meat, seconds = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
+    x = np.array([loop.lag, loop.delay, loop.integral])
+    steps = np.array([1e-3, 1e-3, 0.05])
+    for command, rate, dt in _pieces([flight]):
+        sos = signal.butter(2, min(BANDWIDTH, 0.4 / dt), fs=1.0 / dt, output="sos")
+        skip, thin = int(0.5 / dt), max(1, int(0.1 / (BANDWIDTH * dt)))
+
+        def seen(
+            x: np.ndarray,
+            command: np.ndarray = command,
+            dt: float = dt,
+            sos: np.ndarray = sos,
+            rows: slice = slice(skip, None, thin),
+        ) -> np.ndarray:
+            return np.asarray(signal.sosfiltfilt(sos, respond(command, dt, x[1], x[0], x[2]), axis=0))[rows]
+
+        here = seen(x)
+        jacobian = np.stack([(seen(x + h) - here) / h.sum() for h in np.diag(steps)], axis=2)
+        residual = signal.sosfiltfilt(sos, rate, axis=0)[skip::thin] - here
+        bread += np.einsum("kap,kaq->pq", jacobian, jacobian)
+        scores = np.einsum("kap,ka->kp", jacobian, residual)
+        meat += S_hac_simple(scores, nlags=max(1, round(HAC_LAG / (thin * dt))))
+        seconds += len(rate) * dt
+    inverse = np.linalg.pinv(bread, hermitian=True)
+    return inverse @ meat @ inverse, critical_value(seconds)
+
+
 def respond(command: np.ndarray, dt: float, delay: float, lag: float, integral: float) -> np.ndarray:
     """Body rates (N, k) of the rate loop at rest under commanded rates (N, k), held between samples of `dt` s."""
     from scipy import signal

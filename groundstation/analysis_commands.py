@@ -286,6 +286,8 @@ def effects_command(
                         for p in e.parameters
                     },
                     "needs": list(e.needs),
+                    "needs_any": list(e.needs_any),
+                    "seen_in": "rotation" if e.rotational else "acceleration",
                     "manoeuvre": e.manoeuvre,
                     "confounded_with": list(e.confounded_with),
                     "citation": e.citation,
@@ -302,9 +304,10 @@ def effects_command(
         for p in e.parameters:
             unit = "" if p.unit == "1" else f" {p.unit}"
             console.print(f"  {p.name}: {p.meaning}, {p.low:g} to {p.high:g}{unit}")
-        console.print(f"needs: {', '.join(e.needs)}")
+        either = f"{', ' if e.needs else ''}{' or '.join(e.needs_any)}" if e.needs_any else ""
+        console.print(f"needs: {', '.join(e.needs)}{either}")
         console.print(f"fly: {e.manoeuvre}")
-        console.print(f"confounded with: {', '.join((*e.confounded_with, *e.aliases)) or 'nothing known'}")
+        console.print(f"confounded with: {', '.join((*e.confounded_with, *e.aliases)) or e.unconfounded}")
         console.print(f"source: {e.citation}")
         return
     table = Table()

@@ -58,6 +58,7 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
                 },
                 "indistinguishable_from": list(e.indistinguishable_from),
                 "advice": e.advice,
+                "seen_in": e.seen_in,
             }
             for e in d.effects
         ],
@@ -66,6 +67,8 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
         "left_out": d.left_out,
         "notes": list(d.flight.notes),
     }
+    if d.rotational is not None:
+        table["rotational_rms"] = {**asdict(d.rotational), "unit": "rad/s^2"}
     if d.validation_before is not None:
         table["validation_rms"] = {"before": d.validation_before, "after": d.validation_after, "unit": UNIT}
     return plain(table)

@@ -8,6 +8,7 @@ from groundstation import (
     analysis_commands,
     bound_commands,
     collect_commands,
+    effect_commands,
     flight_commands,
     pilot_commands,
     reproduce_commands,
@@ -31,6 +32,7 @@ train_commands.register(app)
 pilot_commands.register(app)
 collect_commands.register(app)
 reproduce_commands.register(app)
+effect_commands.register(app)
 
 
 def main() -> None:

@@ -10,7 +10,8 @@ rivals: where the exchange costs nothing, the data cannot tell them apart, and b
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy import stats
@@ -20,20 +21,24 @@ from groundstation.fitting import (
     Problem,
     block_errors,
     fit,
+    free_parameters,
     long_run_variance,
     model_of,
+    robust_covariance,
     with_clock,
 )
 from groundstation.measurement import Measurement, measure
 from groundstation.remainder import unexplained
 from groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
-from models.effect import Effect, Stage
+from groundstation.rotation import RotationalFindings, judge_rates, judge_rotation
+from models.effect import Effect, Parameter, Stage
 from models.effects import catalogue, effect_named
+from models.errors import InputError
 from models.flight import Flight
 from models.model import Model, Term
 
-SIGNIFICANCE = 0.001
-"""Largest p-value of an effect that is called missing: a familywise 1 % over the ten or so candidates."""
+FAMILY = 0.01
+"""Probability that any effect at all is significant by chance, shared by all candidates (Bonferroni)."""
 MATERIAL_SHARE = 0.01
 """Smallest part of the remaining squared error that an effect must take away on held-out blocks."""
 MATERIAL_ACCELERATION = 0.02
@@ -44,6 +49,11 @@ SCREENED = 3
 """Acceptable candidates fitted in full at each step, the most promising first."""
 STRONG_EVIDENCE = 6.0
 """Twice the log likelihood ratio from which one explanation is told from another (Kass & Raftery 1995)."""
+LINEARISED = 2.0
+"""Factor that the linearised gain of an effect is trusted to, before a full fit is saved by it."""
+LONG, PART = 240.0, 20.0
+"""s of flight beyond which effects are looked for in parts of so many s, as much altogether, spread evenly; what is
+found is fitted to all of the flight and dropped where that does not support it."""
 MOST_EFFECTS = 6
 
 
@@ -73,21 +83,46 @@ def diagnose(
 
     Raises `InputError` where the flight lacks the columns for any comparison, or is too short.
     """
-    measurement = measure(flight, bandwidth)
+    whole = Problem((measure(flight, bandwidth),), base.effects_directory, base.network_chain())
     held_out = None if validation is None else measure(validation, bandwidth)
-    search = _Search(
-        Problem((measurement,), base.effects_directory, base.network_chain()), base, held_out, progress
-    )
-    return search.run()
+    progress("looking at the rotation")
+    rotation = judge_rotation(flight, base.names(), base.effects_directory)
+    everything = _Search(whole, base, held_out, rotation, progress)
+    if flight.duration <= LONG:
+        return everything.report(everything.select(), everything)
+    parts = replace(whole, measurements=_spread(flight, bandwidth) or whole.measurements)
+    search = _Search(parts, base, held_out, rotation, progress)
+    found = search.select()
+    progress("fitting what was found to the whole flight")
+    kept = everything.settle(found.added)
+    return search.report(search.state(kept.added), everything)
+
+
+def _spread(flight: Flight, bandwidth: float | None) -> tuple[Measurement, ...]:
+    """Parts of `PART` s, evenly spread over a long flight; those that cannot be compared are left out."""
+    rows = round(PART / flight.dt)
+    found = []
+    for start in np.linspace(0, len(flight) - rows, round(LONG / PART)).astype(int):
+        try:
+            found.append(measure(flight.part(slice(start, start + rows)), bandwidth))
+        except InputError:
+            continue
+    return tuple(found)
 
 
 class _Search:
     """One diagnosis: fits are kept by their set of effects, for the steps visit many sets again."""
 
     def __init__(
-        self, problem: Problem, base: Model, held_out: Measurement | None, progress: Callable[[str], None]
+        self,
+        problem: Problem,
+        base: Model,
+        held_out: Measurement | None,
+        rotation: RotationalFindings,
+        progress: Callable[[str], None],
     ) -> None:
         self.problem, self.base, self.progress = problem, base, progress
+        self.rotation = rotation
         self.held_out = (
             None if held_out is None else Problem((held_out,), base.effects_directory, base.network_chain())
         )
@@ -95,14 +130,19 @@ class _Search:
         self.known = catalogue(base.effects_directory)
         self.candidates = [n for n in self.known if n not in base.names() and self._measurable(self.known[n])]
         self.samples = problem.measured().size
+        self.significance = FAMILY / max(1, len(self.candidates))
         self._states: dict[frozenset[str], _State] = {}
 
+    @property
+    def flight(self) -> Flight:
+        """The flight, or its first part."""
+        return self.problem.measurements[0].flight
+
     def _measurable(self, effect: Effect) -> bool:
-        flight = self.problem.measurements[0].flight
-        if effect.name == "accelerometer_bias" and flight.specific_force is None:
+        flight = self.flight
+        if effect.rotational or (effect.stage is Stage.SENSOR and not flight.accelerometer):
             return False
-        needs = [n for n in effect.needs if n != "specific_force"]
-        return bool(effect.parameters) and flight.has(*needs)
+        return bool(effect.parameters) and not effect.lacks(flight)
 
     def state(self, added: Sequence[str]) -> _State:
         """The base model with `added`, all of `added` fitted."""
@@ -110,15 +150,20 @@ class _Search:
         if key not in self._states:
             near = max((k for k in self._states if k <= key), key=len, default=frozenset())
             start = {t.effect: t.values for t in self._states[near].fit.terms} if near else {}
-            terms = [*self.base.terms, *(Term(n, start.get(n, {})) for n in added)]
+            # what the rotation has found acts on the thrust, too, and is not fitted to it once more
+            terms = [*self.base.terms, *self.rotation.terms, *(Term(n, start.get(n, {})) for n in added)]
             fitted = fit(self.problem, terms, refit=list(added))
             self._states[key] = _State(tuple(added), fitted, block_errors(fitted, self.blocks))
         return self._states[key]
 
     # --- the steps ------------------------------------------------------------------------------------------
 
-    def run(self) -> Diagnosis:
-        """Select, exchange, judge."""
+    def settle(self, added: Sequence[str]) -> _State:
+        """The fit of `added`, without those that this flight does not support."""
+        return self._agrees_with_held_out(self._backward(self.state(added)))
+
+    def select(self) -> _State:
+        """The effects that are missing."""
         current = self.state(())
         visited = {frozenset(current.added)}
         while len(current.added) < MOST_EFFECTS:
@@ -131,8 +176,7 @@ class _Search:
                 break
             visited.add(frozenset(following.added))
             current = following
-        current = self._agrees_with_held_out(current)
-        return self._report(current)
+        return self._agrees_with_held_out(current)
 
     def _steps(self, current: _State) -> list[tuple[str, ...]]:
         """What may be added at once: one effect, or two where the one acts only through the other."""
@@ -177,20 +221,20 @@ class _Search:
         """Reduction of the squared error by the step, linearised at the current optimum and at its typical
         size."""
         values = {t.effect: dict(t.values) for t in current.fit.terms}
-        vehicle = self.problem.vehicle
         here = -current.fit.residual + 0.0
         chain = [(effect_named(n, self.base.effects_directory), v) for n, v in values.items()]
         base = self.problem.measured() + here
         columns = []
         for name in step:
             effect = self.known[name]
-            neutral = dict(values.get(name, effect.neutral(vehicle)))
+            neutral = dict(values.get(name, self._at_rest(effect)))
             rest = [(e, v) for e, v in chain if e.name != name]
-            for p in effect.parameters:
+            typical = effect.typical(self.problem.survey)
+            for p in _sizes(effect):
                 moved = {**neutral, p.name: p.typical if p.typical != neutral[p.name] else p.typical * 1.5}
                 prediction = self.problem.predict([*rest, (effect, moved)])
                 columns.append((prediction - base).ravel())
-            chain = [*rest, (effect, {p.name: p.typical for p in effect.parameters})]
+            chain = [*rest, (effect, typical)]
             base = self.problem.predict(chain) if len(step) > 1 else base
         matrix = np.column_stack([current.fit.jacobian.reshape(self.samples, -1), *columns])
         residual = current.fit.residual.ravel()
@@ -198,6 +242,12 @@ class _Search:
             matrix.T @ matrix + 1e-9 * np.eye(matrix.shape[1]), matrix.T @ residual, rcond=None
         )[0]
         return float(residual @ matrix @ solution)
+
+    def _at_rest(self, effect: Effect) -> dict[str, float]:
+        """Parameter values without effect, placed where it would act on this flight."""
+        placed = effect.typical(self.problem.survey)
+        neutral = effect.neutral(self.problem.vehicle)
+        return {p.name: placed[p.name] if p.structural else neutral[p.name] for p in effect.parameters}
 
     def _contribution(self, current: _State, name: str, through: str | None = None) -> np.ndarray:
         """What the effect at its typical size changes in the predicted specific force, (K A, P): one column each.
@@ -207,11 +257,11 @@ class _Search:
         values = {t.effect: dict(t.values) for t in current.fit.terms}
         effect = self.known[name]
         if through is not None:
-            values[through] = {p.name: p.typical for p in self.known[through].parameters}
+            values[through] = self.known[through].typical(self.problem.survey)
         rest = [(self.known[n], v) for n, v in values.items() if n != name]
-        neutral = effect.neutral(self.problem.vehicle)
+        neutral = self._at_rest(effect)
         base = self.problem.predict([*rest, (effect, neutral)])
-        moved = ({**neutral, p.name: p.typical} for p in effect.parameters)
+        moved = ({**neutral, p.name: p.typical} for p in _sizes(effect))
         return np.column_stack([(self.problem.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
 
     def _shows(self, candidate: _State, name: str) -> bool:
@@ -222,11 +272,11 @@ class _Search:
         mine = self._contribution(candidate, name).sum(axis=1)
         simpler = np.column_stack([self._contribution(candidate, n) for n in beyond])
         rest = mine - simpler @ np.linalg.lstsq(simpler, mine, rcond=None)[0]
-        return self._power(candidate, float(np.sum(rest**2)), len(self.known[name].parameters)) > SURE_TO_SEE
+        return self._power(candidate, float(np.sum(rest**2)), len(_sizes(self.known[name]))) > SURE_TO_SEE
 
     def _power(self, current: _State, energy: float, count: int) -> float:
         """Probability that `count` parameters are significant when what they change has this squared sum."""
-        threshold = stats.chi2.isf(SIGNIFICANCE, count) * (current.fit.critical / 1.96) ** 2
+        threshold = stats.chi2.isf(self.significance, count) * (current.fit.critical / 1.96) ** 2
         unit = long_run_variance(self.problem, current.fit.residual)
         return float(stats.ncx2.sf(threshold, count, energy / unit))
 
@@ -245,7 +295,7 @@ class _Search:
         return (
             gain > MATERIAL_SHARE * len(step)
             and size > MATERIAL_ACCELERATION
-            and all(candidate.fit.wald(n) < SIGNIFICANCE for n in step)
+            and all(candidate.fit.wald(n) < self.significance for n in step)
             and self._evident(candidate, current)
             and all(self._plausible(candidate.fit, n) for n in candidate.added)
         )
@@ -268,7 +318,7 @@ class _Search:
                 without = self._without(current, name)
                 useful = (
                     self._gain(current, without) > MATERIAL_SHARE
-                    and current.fit.wald(name) < SIGNIFICANCE
+                    and current.fit.wald(name) < self.significance
                     and self._evident(current, without)
                     and self._plausible(current.fit, name)
                 )
@@ -327,6 +377,8 @@ class _Search:
                 self.known[n].with_any and not {*present, rival} & set(self.known[n].with_any) for n in rest
             ):
                 continue
+            if self._cannot_stand_in(current, name, rival):
+                continue
             other = self.state((*rest, rival))
             if not self._plausible(other.fit, rival):
                 continue
@@ -335,14 +387,24 @@ class _Search:
                 found.append(rival)
         return tuple(found)
 
+    def _cannot_stand_in(self, current: _State, name: str, rival: str) -> bool:
+        """Whether the linearised rival takes away so little of what the effect does that no fit need be made."""
+        without = self._without(current, name)
+        lost = without.fit.sse - current.fit.sse
+        unit = long_run_variance(self.problem, current.fit.residual)
+        near = LINEARISED * self._screen(without, (rival,))
+        return near < lost and (lost - near) / unit > LINEARISED * STRONG_EVIDENCE
+
     def _evidence(self, for_: Fit, against: Fit) -> float:
         """Evidence for one fit against another with as many effects, on the scale of twice a log likelihood ratio:
         squared error in units of one independent sample, and the distance of the parameters from "no effect"."""
         unit = long_run_variance(self.problem, for_.residual)
         return (against.sse - for_.sse) / unit + against.surprise - for_.surprise
 
-    def _report(self, current: _State) -> Diagnosis:
-        before = self._before()
+    def report(self, current: _State, whole: _Search) -> Diagnosis:
+        """The verdicts; figures of what was found are those of the whole flight, which `whole` sees."""
+        here = whole.state(current.added)
+        before, all_before = self._before(), whole._before()
         verdicts = [EffectVerdict(n, "included", None, 0.0, 0.0, (), (), "") for n in self.base.names()]
         rivals = {n: self._rivals(current, n) for n in current.added}
         found = []
@@ -358,9 +420,9 @@ class _Search:
                     "possible" if same else "missing",
                     rank,
                     float(np.clip(share, 0.0, 1.0)),
-                    current.fit.wald(name),
-                    self._estimates(current.fit, name),
-                    (*same, *effect.aliases),
+                    here.fit.wald(name),
+                    self._estimates(here.fit, name),
+                    (*same, *effect.aliases, *self._seen_as(name, here.fit)),
                     f"to tell it from {', '.join(same)}, fly {effect.manoeuvre}" if same else _add(effect),
                 )
             )
@@ -370,36 +432,66 @@ class _Search:
         ]
         verdicts += sorted(rest, key=lambda v: (v.verdict != "possible", v.p_value))
         for name, effect in self.known.items():
-            if name not in self.candidates and name not in self.base.names():
+            if name not in self.candidates and name not in self.base.names() and not effect.rotational:
                 verdicts.append(self._judge_unmeasured(effect))
-        validation_after = self._held_out_error(current)
+        rates, rate_terms = judge_rates(
+            whole.flight, self.base.names(), self.base.effects_directory, self._later(here)
+        )
+        rank = len(found)
+        for verdict in (*self.rotation.verdicts, *rates):
+            rank += verdict.rank is not None
+            verdicts.append(replace(verdict, rank=None if verdict.rank is None else rank))
+        validation_after = whole._held_out_error(here)
         held_samples = 0 if self.held_out is None else self.held_out.measured().size
-        m = self.problem.measurements[0]
+        m = whole.problem.measurements[0]
         axes = list(m.axes)
-        shift = [float(current.fit.estimate[i]) for i, f in enumerate(current.fit.free) if f.nuisance]
-        final = model_of(current.fit, self.base)
+        shift = [float(here.fit.estimate[i]) for i, f in enumerate(here.fit.free) if f.nuisance]
+        final = model_of(here.fit, self.base)
+        final = final.with_terms((*final.terms, *rate_terms))
         return Diagnosis(
             flight=m.flight,
             base=self.base,
             model=final,
-            rms_before=float(np.sqrt(before)),
-            rms_after=float(np.sqrt(current.fit.sse / self.samples)),
+            rms_before=float(np.sqrt(all_before)),
+            rms_after=float(np.sqrt(here.fit.sse / whole.samples)),
             noise_floor=float(np.sqrt(np.mean(m.noise[axes] ** 2))),
             bandwidth=m.bandwidth,
             axes=m.axes,
-            validation_before=None if self.held_out is None else float(np.sqrt(self._before(self.held_out))),
+            validation_before=None if self.held_out is None else float(np.sqrt(whole._before(held_out=True))),
             validation_after=None
             if validation_after is None
             else float(np.sqrt(validation_after / held_samples)),
             clock_shift=shift[0] - self.problem.vehicle.command_delay if shift else None,
             effects=tuple(verdicts),
-            unexplained=unexplained(m, current.fit.residual),
+            unexplained=unexplained(m, here.fit.residual),
             left_out=m.left_out,
+            rotational=self.rotation.rms,
         )
 
-    def _before(self, problem: Problem | None = None) -> float:
+    def _later(self, current: _State) -> float:
+        """s by which rotors were found to follow their command later than believed: the rate loop is built on them."""
+        vehicle, later = self.problem.vehicle, 0.0
+        for term in current.fit.terms:
+            if term.effect in current.added and self.known[term.effect].stage is Stage.COMMAND:
+                for p in self.known[term.effect].parameters:
+                    later += max(0.0, float(term.values[p.name]) - p.neutral_for(vehicle))
+        return later
+
+    def _seen_as(self, name: str, fitted: Fit) -> tuple[str, ...]:
+        """Rotational effects that may be what `name` shows, where the flight lacks the columns to tell."""
+        flight = self.flight
+        return tuple(
+            e.name
+            for e in self.known.values()
+            if name in e.seen_as
+            and e.lacks(flight)
+            and all(fitted.estimate[i] < 1.0 for i in fitted.of(name))
+        )
+
+    @cache  # noqa: B019 - a search lives as long as its diagnosis
+    def _before(self, held_out: bool = False) -> float:
         """Mean squared error of the base model as it stands, nothing refitted but the clock."""
-        problem = problem or self.problem
+        problem = self.held_out if held_out and self.held_out is not None else self.problem
         chain = with_clock(problem.measurements[0], self.base.chain())
         alone = [(effect, values) for effect, values in chain if effect.stage is not Stage.REMAINDER]
         return float(np.mean((problem.measured() - problem.predict(alone)) ** 2))
@@ -425,12 +517,14 @@ class _Search:
             through = next((n for n in effect.with_any if n in self.candidates), None)
             if through is None:
                 return self._judge_unmeasured(effect)
-            extended = self.state((*current.added, through, name))
+            extended = self.state((*current.added, through, name)).fit
+        elif effect.stage is Stage.COMMAND or any(p.even for p in effect.parameters):
+            extended = self.state((*current.added, name)).fit
         else:
-            extended = self.state((*current.added, name))
-        share = (current.fit.sse - extended.fit.sse) / (self._before() * self.samples)
-        p = extended.fit.wald(name)
-        estimates = self._estimates(extended.fit, name)
+            extended = self._beside(current, name)
+        share = (current.fit.sse - extended.sse) / (self._before() * self.samples)
+        p = extended.wald(name)
+        estimates = self._estimates(extended, name)
         if stands_for:
             # as a stand-in for the effect found, not beside it
             swapped = self.state(tuple(name if n == stands_for[0] else n for n in current.added))
@@ -442,6 +536,24 @@ class _Search:
             return EffectVerdict(name, "not_excited", None, share, p, estimates, (), advice)
         return EffectVerdict(name, "not_supported", None, share, p, estimates, (), "")
 
+    def _beside(self, current: _State, name: str) -> Fit:
+        """The effect beside all that is fitted, by one Gauss-Newton step from the present optimum."""
+        effect, here = self.known[name], current.fit
+        rest = self._at_rest(effect)
+        own = [f for f in free_parameters(effect, self.problem.survey) if not f.parameter.structural]
+        free = (*here.free, *own)
+        scale = np.array([f.parameter.typical - rest[f.parameter.name] for f in own])
+        columns = -self._contribution(current, name) / scale
+        jacobian = np.concatenate([here.jacobian, columns.reshape(*here.residual.shape, len(own))], axis=2)
+        start = np.concatenate([here.estimate, [rest[f.parameter.name] for f in own]])
+        weight = np.sqrt(self.problem.unit()) / np.array([f.spread for f in free])
+        flat = jacobian.reshape(self.samples, -1)
+        pull = weight**2 * (start - np.array([f.neutral for f in free]))
+        step = -np.linalg.solve(flat.T @ flat + np.diag(weight**2), flat.T @ here.residual.ravel() + pull)
+        residual = here.residual + jacobian @ step
+        covariance, critical = robust_covariance(self.problem, jacobian, residual, weight)
+        return Fit(here.terms, free, start + step, covariance, critical, jacobian, residual)
+
     def _excited(self, current: _State, name: str, through: str | None) -> bool:
         """Whether this flight would have shown the effect at its typical size, beside what is being fitted."""
         mine = self._contribution(current, name, through).sum(axis=1)
@@ -450,18 +562,22 @@ class _Search:
             mine = mine - fitted @ np.linalg.lstsq(fitted, mine, rcond=None)[0]
         energy = float(np.sum(mine**2))
         material = np.sqrt(energy / len(self.problem.measured())) > MATERIAL_ACCELERATION
-        power = self._power(current, energy, len(self.known[name].parameters))
+        power = self._power(current, energy, len(_sizes(self.known[name])))
         return bool(material and power > SURE_TO_SEE and energy > MATERIAL_SHARE * current.fit.sse)
 
     def _judge_unmeasured(self, effect: Effect) -> EffectVerdict:
         """The verdict on an effect whose measurements the flight lacks."""
-        flight = self.problem.measurements[0].flight
-        missing = [n for n in effect.needs if not flight.has(n)]
+        missing = effect.lacks(self.flight)
         through = f" and one of {', '.join(effect.with_any)} in the model" if effect.with_any else ""
         advice = (
             f"needs {', '.join(missing) or 'measurements'}{through}; record it, and fly {effect.manoeuvre}"
         )
         return EffectVerdict(effect.name, "not_excited", None, 0.0, 1.0, (), (), advice)
+
+
+def _sizes(effect: Effect) -> list[Parameter]:
+    """The parameters that say how much of the effect there is."""
+    return [p for p in effect.parameters if not p.structural]
 
 
 def _add(effect: Effect) -> str:

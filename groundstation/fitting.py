@@ -49,7 +49,9 @@ class Free:
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the prior."""
+        """Standard deviation of the prior: two typical sizes, or half the range where no value is "no effect"."""
+        if self.parameter.structural:
+            return 0.5 * (self.parameter.high - self.parameter.low)
         return max(2.0 * abs(self.parameter.typical - self.neutral), 1e-6)
 
 
@@ -72,14 +74,21 @@ class Problem:
     def predict(self, chain: Sequence[tuple[Effect, Mapping[str, float]]]) -> np.ndarray:
         """Predicted specific force (K, A) of the used samples of all flights, behind each flight's filter."""
         parts = []
-        for m, motion in zip(self.measurements, self._motions, strict=True):
+        for m, motion in zip(self.measurements, self.motions, strict=True):
             force = m.see(specific_force(act(motion, [*chain, *self.always])))
             parts.append(force[m.used][:, m.axes])
         return np.concatenate(parts)
 
     @cached_property
-    def _motions(self) -> tuple[Motion, ...]:
+    def motions(self) -> tuple[Motion, ...]:
+        """Each flight as effects see it, before any of them acts."""
         return tuple(motion_of_flight(m.flight) for m in self.measurements)
+
+    @cached_property
+    def survey(self) -> Motion:
+        """What tells where the flights went: the motion that reached highest."""
+        heights = [-np.inf if m.height is None else float(np.max(m.height)) for m in self.motions]
+        return self.motions[int(np.argmax(heights))]
 
     def measured(self) -> np.ndarray:
         """Measured specific force (K, A) of the used samples."""
@@ -135,6 +144,10 @@ class Fit:
         """Columns of the free numbers that belong to `effect`."""
         return [i for i, f in enumerate(self.free) if f.effect == effect and not f.nuisance]
 
+    def sizes(self, effect: str) -> list[int]:
+        """Those of them that have a value of "no effect"."""
+        return [i for i in self.of(effect) if not self.free[i].parameter.structural]
+
     def interval(self, index: int) -> tuple[float, float]:
         """95 % interval of one free number."""
         half = half_width(self.free[index], self.covariance[index, index], self.critical)
@@ -145,7 +158,7 @@ class Fit:
 
         The fixed-b factor of one number is applied to the statistic as a whole.
         """
-        columns = self.of(effect)
+        columns = self.sizes(effect)
         if not columns:
             return 1.0
         neutral = np.array([self._neutral(i) for i in columns])
@@ -174,21 +187,20 @@ def critical_value(duration: float) -> float:
 
 
 def free_parameters(
-    effect: Effect, vehicle: Vehicle, start: Mapping[str, float] | None = None, period: float = 0.0
+    effect: Effect, motion: Motion, start: Mapping[str, float] | None = None, period: float = 0.0
 ) -> list[Free]:
-    """The numbers of `effect` to fit, on a clock of `period` s.
+    """The numbers of `effect` to fit to a flight, on a clock of `period` s.
 
     Bounds reach a little beyond the plausible range, so that data may contradict
     the effect instead of resting on its bound."""
     free = []
+    sizes = effect.typical(motion)
     for p in effect.parameters:
-        neutral = p.neutral_for(vehicle)
-        margin = (
-            0.0
-            if effect.stage is Stage.COMMAND or effect.name == "ground_effect"
-            else 2.0 * abs(p.typical - neutral)
-        )
-        value = (start or {}).get(p.name, neutral + 0.3 * (p.typical - neutral))
+        typical = sizes[p.name]
+        neutral = typical if p.structural else p.neutral_for(motion.vehicle)
+        within = effect.stage is Stage.COMMAND or p.even or p.structural
+        margin = 0.0 if within else 2.0 * abs(p.typical - neutral)
+        value = (start or {}).get(p.name, neutral + 0.3 * (typical - neutral))
         low, high = p.low - margin, p.high + margin
         tolerance = period if effect.name == "transport_delay" else 0.0
         value = float(np.clip(value, low + 1e-9, high - 1e-9))
@@ -213,9 +225,9 @@ def fit(
     free: list[Free] = []
     period = max(m.flight.dt for m in problem.measurements)
     for term in terms:
-        if refit is None or term.effect in refit:
-            effect = effect_named(term.effect, problem.effects_directory)
-            free += free_parameters(effect, vehicle, term.values or None, period)
+        effect = effect_named(term.effect, problem.effects_directory)
+        if (refit is None or term.effect in refit) and not effect.rotational:
+            free += free_parameters(effect, problem.survey, term.values or None, period)
     chain_names = list(names)
     if clock and "transport_delay" not in names:
         parameter, believed = effect_named("transport_delay").parameters[0], vehicle.command_delay
@@ -234,19 +246,7 @@ def fit(
     weight = np.sqrt(problem.unit()) / np.array([f.spread for f in free])
     neutral = np.array([f.neutral for f in free])
     if free:
-        solution = optimize.least_squares(
-            lambda x: np.concatenate([residual(x), weight * (x - neutral)]),
-            np.array([f.start for f in free]),
-            jac=lambda x: np.concatenate([_jacobian(residual, x, free), np.diag(weight)]),
-            bounds=([f.low for f in free], [max(f.high, f.low + 1e-9) for f in free]),
-            x_scale=np.array([f.spread for f in free]),
-            ftol=tolerance,
-            xtol=1e-5,
-            gtol=1e-12,
-            max_nfev=25,
-        )
-        estimate, flat = solution.x, solution.fun[: measured.size]
-        jacobian = solution.jac[: measured.size]
+        estimate, flat, jacobian = _minimise(residual, free, weight, neutral, tolerance)
     else:
         estimate, flat, jacobian = np.zeros(0), residual(np.zeros(0)), np.zeros((measured.size, 0))
     k, a = measured.shape
@@ -265,11 +265,80 @@ def fit(
     return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a))
 
 
+def _minimise(
+    residual: Callable[[np.ndarray], np.ndarray],
+    free: Sequence[Free],
+    weight: np.ndarray,
+    neutral: np.ndarray,
+    tolerance: float,
+    most: int = 25,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bounded Levenberg-Marquardt (Nocedal & Wright, Numerical Optimization, 2nd ed., ch. 10): estimate, residual there
+    and Jacobian beside it.
+
+    Nearly all effects are linear in their parameters, so that two steps are enough; a step that meets a bound is taken
+    again with that number held.
+    """
+    low = np.array([f.low for f in free])
+    high = np.array([max(f.high, f.low + 1e-9) for f in free])
+    spread = np.array([f.spread for f in free])
+    x = np.clip(np.array([f.start for f in free]), low, high)
+    flat = residual(x)
+
+    def cost_of(x: np.ndarray, flat: np.ndarray) -> float:
+        return float(flat @ flat + np.sum((weight * (x - neutral)) ** 2))
+
+    cost, damping = cost_of(x, flat), 1e-8
+    jacobian = _jacobian(residual, x, free, flat)
+    for _ in range(most):
+        normal = jacobian.T @ jacobian + np.diag(weight**2)
+        slope = jacobian.T @ flat + weight**2 * (x - neutral)
+        moved = False
+        for _ in range(8):
+            step = _bounded_step(normal + damping * np.diag(np.diag(normal)), slope, x, low, high)
+            tried = residual(x + step)
+            there = cost_of(x + step, tried)
+            if there <= cost:
+                moved = True
+                break
+            damping = max(damping, 1e-6) * 30.0
+        if not moved:
+            break
+        gained = cost - there
+        x, flat, cost, damping = x + step, tried, there, damping / 10.0
+        small = gained < tolerance * cost or bool(np.all(np.abs(step) < 1e-5 * spread))
+        if small and bool(np.all(np.abs(step) < 0.05 * spread)):
+            break
+        jacobian = _jacobian(residual, x, free, flat)
+        if small:
+            break
+    return x, flat, jacobian
+
+
+def _bounded_step(
+    normal: np.ndarray, slope: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """The step to the minimum of a quadratic within bounds, by holding what runs into one."""
+    step = np.zeros_like(x)
+    loose = np.ones(len(x), dtype=bool)
+    for _ in range(len(x)):
+        inner = normal[np.ix_(loose, loose)]
+        rest = slope[loose] + normal[np.ix_(loose, ~loose)] @ step[~loose]
+        step[loose] = -np.linalg.lstsq(inner, rest, rcond=1e-14)[0]
+        over = loose & ((x + step < low) | (x + step > high))
+        if not over.any():
+            break
+        step[over] = np.clip(x + step, low, high)[over] - x[over]
+        loose &= ~over
+        if not loose.any():
+            break
+    return step
+
+
 def _jacobian(
-    residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, free: Sequence[Free]
+    residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, free: Sequence[Free], base: np.ndarray
 ) -> np.ndarray:
     """Forward differences with steps of a hundredth of each prior's width, away from the upper bound."""
-    base = residual(x)
     columns = np.empty((base.size, len(x)))
     for i, f in enumerate(free):
         step = 0.01 * f.spread

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import ndimage, signal
@@ -12,6 +13,7 @@ from scipy import ndimage, signal
 from models.errors import InputError
 from models.flight import Flight
 from models.frames import rotate, rotate_inverse
+from models.prediction import derivative
 from models.vehicle import GRAVITY
 
 ACCELEROMETER_BANDWIDTH = 20.0
@@ -23,6 +25,8 @@ RATE_ERROR_LIMIT = 1.0
 the vehicle, so that the collective command no longer tells the thrust."""
 SETTLING = 0.2
 """s around such a moment that are left out as well."""
+ROTATION_BANDWIDTH = 5.0
+"""Hz of angular acceleration, which is a differentiated gyroscope: commanded turns live below it."""
 SHORTEST = 5.0
 """s of flight below which nothing is fitted."""
 
@@ -48,6 +52,81 @@ class Measurement:
     noise: np.ndarray
     axes: tuple[int, ...]
     left_out: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """The measured rotation of a flight, ready to be compared.
+
+    `value` (M, 3) is angular acceleration in body axes, rad/s², low-passed at `bandwidth` Hz and thinned to the rows
+    `rows` of the flight; `used` (M,), `t` (M,) in s, `smooth` and `noise` (3,) as in `Measurement`.
+    """
+
+    flight: Flight
+    t: np.ndarray
+    rows: np.ndarray
+    value: np.ndarray
+    used: np.ndarray
+    smooth: Callable[[np.ndarray], np.ndarray]
+    bandwidth: float
+    noise: np.ndarray
+
+
+def measure_rotation(flight: Flight) -> Rotation | None:
+    """The angular acceleration of `flight` from its gyroscope; None where it has none or is too short."""
+    fs = 1.0 / flight.dt
+    if flight.angular_velocity is None or flight.duration < SHORTEST:
+        return None
+    bandwidth = min(ROTATION_BANDWIDTH, 0.4 * fs)
+    sos = signal.butter(4, bandwidth, fs=fs, output="sos")
+    rows = np.arange(0, len(flight), max(1, int(fs / (2.5 * bandwidth))))
+    pieces = _pieces(flight)
+
+    def smooth(x: np.ndarray) -> np.ndarray:
+        return _low_pass(x, sos, pieces, fs)[rows]
+
+    used = np.ones(len(flight), dtype=bool) if flight.flying is None else flight.flying.copy()
+    edge = max(2, int(0.5 / bandwidth / flight.dt))
+    for piece in pieces:
+        used[piece.start : piece.start + edge] = False
+        used[max(piece.stop - edge, piece.start) : piece.stop] = False
+    if used.sum() * flight.dt < SHORTEST:
+        return None
+    return Rotation(
+        flight=flight,
+        t=flight.t[rows],
+        rows=rows,
+        value=smooth(derivative(flight.angular_velocity, flight.t)),
+        used=used[rows],
+        smooth=smooth,
+        bandwidth=bandwidth,
+        noise=_noise(flight.angular_velocity, used, sos, fs, True),
+    )
+
+
+def _low_pass(x: np.ndarray, sos: np.ndarray, pieces: list[slice], fs: float) -> np.ndarray:
+    """Zero-phase low-pass of columns (N, k) that reaches across no gap.
+
+    As `scipy.signal.sosfiltfilt`, which works out the filter's steady state anew at every call.
+    """
+    out = np.empty_like(x)
+    steady = _steady_state(sos.tobytes())
+    for piece in pieces:
+        part = x[piece]
+        pad = min(len(part) - 1, int(fs))
+        extended = np.concatenate(
+            [2.0 * part[:1] - part[pad:0:-1], part, 2.0 * part[-1:] - part[-2 : -pad - 2 : -1]]
+        )
+        forward, _ = signal.sosfilt(sos, extended, axis=0, zi=steady[:, :, None] * extended[0])
+        backward, _ = signal.sosfilt(sos, forward[::-1], axis=0, zi=steady[:, :, None] * forward[-1])
+        out[piece] = backward[::-1][pad : pad + len(part)]
+    return out
+
+
+@cache
+def _steady_state(sos: bytes) -> np.ndarray:
+    """State of the filter under a constant one, (sections, 2)."""
+    return signal.sosfilt_zi(np.frombuffer(sos).reshape(-1, 6))
 
 
 def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -> Measurement:
@@ -80,10 +159,7 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
     pieces = _pieces(flight)
 
     def low_pass(x: np.ndarray) -> np.ndarray:
-        out = np.empty_like(x)
-        for piece in pieces:
-            out[piece] = signal.sosfiltfilt(sos, x[piece], axis=0, padlen=min(len(x[piece]) - 1, int(fs)))
-        return out
+        return _low_pass(x, sos, pieces, fs)
 
     def smooth(x: np.ndarray) -> np.ndarray:
         return low_pass(x)[rows]

@@ -145,7 +145,7 @@ class EffectVerdict:
 
     `verdict` is one of missing, possible, not_supported, not_excited, included. `variance_share` is the part
     of the squared error before that the effect takes away, given the others; `p_value` robust to
-    autocorrelation.
+    autocorrelation. `seen_in` is "acceleration" or "rotation": shares and ranks are each among their own.
     """
 
     name: str
@@ -156,6 +156,17 @@ class EffectVerdict:
     parameters: tuple[ParameterEstimate, ...]
     indistinguishable_from: tuple[str, ...]
     advice: str
+    seen_in: str = "acceleration"
+
+
+@dataclass(frozen=True)
+class RotationalRms:
+    """Residual of the angular acceleration that the rotors' torques explain, RMS over all axes in rad/s²."""
+
+    before: float
+    after: float
+    noise_floor: float
+    bandwidth: float
 
 
 @dataclass(frozen=True)
@@ -176,6 +187,7 @@ class Diagnosis:
     effects: tuple[EffectVerdict, ...]
     unexplained: Unexplained
     left_out: dict[str, float]
+    rotational: RotationalRms | None = None
 
     def named(self, verdict: str) -> tuple[str, ...]:
         """Names of the effects with this verdict, in order of rank."""

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from groundstation.fitting import Problem, fit, model_of
 from groundstation.measurement import measure
+from groundstation.rotation import fit_rotation
 from models.effects import effect_named
 from models.errors import InputError
 from models.flight import Flight
@@ -98,12 +99,29 @@ def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: f
     for flight in flights:
         for column in known.needs:
             flight.column(column)
+        if known.lacks(flight):
+            raise InputError(
+                f"{flight.origin or flight.name}: {effect} needs {', '.join(known.lacks(flight))}; record it"
+            )
     terms = (
         base.terms
         if "rigid_body" in base.names() or effect == "rigid_body"
         else (Term("rigid_body", {}), *base.terms)
     )
-    return refit(base.with_network(None).with_terms((*terms, Term(effect, {}))), flights, bandwidth)
+    made = base.with_network(None).with_terms((*terms, Term(effect, known.neutral(base.vehicle))))
+    return refit(made, flights, bandwidth)
+
+
+def _turned(term: Term, model: Model, flights: Sequence[Flight]) -> Term:
+    """The term, fitted to the rotation of the first flight that tells, where its effect is a rotational one."""
+    effect = effect_named(term.effect, model.effects_directory)
+    if not effect.rotational:
+        return term
+    fitted = (fit_rotation(flight, effect) for flight in flights if not effect.lacks(flight))
+    found = next((t for t in fitted if t is not None), None)
+    if found is None:
+        raise InputError(f"no flight here tells {term.effect}; fly {effect.manoeuvre}")
+    return found
 
 
 def refit(model: Model, flights: Sequence[Flight], bandwidth: float | None = None) -> Model:
@@ -111,6 +129,7 @@ def refit(model: Model, flights: Sequence[Flight], bandwidth: float | None = Non
     problem = Problem(
         tuple(measure(f, bandwidth) for f in flights), model.effects_directory, model.network_chain()
     )
+    model = model.with_terms(tuple(_turned(t, model, flights) for t in model.terms))
     fitted = fit(problem, model.terms)
     rms = float((fitted.sse / fitted.residual.size) ** 0.5)
     hashes = "+".join(f.data_hash for f in flights)

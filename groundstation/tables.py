@@ -110,6 +110,12 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
     if d.validation_before is not None and d.validation_after is not None:
         line += f"; held-out flight {d.validation_before:.3f} -> {d.validation_after:.3f} m/s²"
     console.print(Text(line, style="bold"))
+    if d.rotational is not None:
+        r = d.rotational
+        console.print(
+            f"angular acceleration {r.before:.3f} -> {r.after:.3f} rad/s² (noise floor {r.noise_floor:.3f})",
+            highlight=False,
+        )
     if d.unexplained.verdict:
         console.print(
             f"Unexplained: {percent(d.unexplained.variance_share)} of what is left can be predicted but fits no known "

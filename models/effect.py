@@ -2,7 +2,8 @@
 
 An effect maps a `Motion` to a `Motion`: it changes the thrust, the air's velocity, the other specific forces or the
 sensor's reading. The same function is used to fit, to predict and to export: it is written against the Array API
-standard and runs on numpy arrays and torch tensors alike.
+standard and runs on numpy arrays and torch tensors alike. Effects on the rotation of the vehicle change the torque, or
+how body rates follow their command; they are seen in the angular acceleration.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
+from models.flight import Flight
 from models.vehicle import Vehicle
 
 Array = Any
@@ -28,6 +30,8 @@ class Stage(IntEnum):
     AIR = 4  # on the velocity of the air
     FORCE = 5  # on the other forces
     SENSOR = 6  # on the reading, not on the vehicle
+    TORQUE = 7  # on the torque, which the angular acceleration shows
+    RATE = 8  # on how body rates follow their command
 
 
 @dataclass(frozen=True)
@@ -39,8 +43,11 @@ class Motion:
     it gives, heading frame; `force` (N, 3) all other forces over mass, body axes, m/s²; `reading` (N, 3) what the
     accelerometer adds, body axes, m/s². `rotation` (N, 3, 3) is body to heading; `air_velocity` (N, 3) the vehicle's
     velocity relative to the air, heading frame, m/s; `cos_yaw`, `sin_yaw` (N,) turn the heading frame into the world;
-    `euler` is (phi, theta), rad; `height` (N,) above ground, m; `voltage` (N,) of the battery, V.
-    Columns that the flight lacks are None.
+    `euler` is (phi, theta), rad; `height` (N,) above ground, m; `voltage` (N,) of the battery, V. `body_rate` (N, 3)
+    in rad/s and `body_acceleration` (N, 3), its derivative, in rad/s²; `rotor_thrust` (N, 4) the thrust of each rotor
+    in N, in the order of the vehicle's rotor_positions, as its speed or its motor command tells; `rotor_speed` (N, 4)
+    in rad/s; `torque` (N, 3) on the body, N m, None where nobody asks for it; all in body axes. `rate_lag`,
+    `rate_delay` in s are those of the body rates behind their command. Columns that the flight lacks are None.
     """
 
     vehicle: Vehicle
@@ -57,8 +64,15 @@ class Motion:
     sin_yaw: Array = None
     height: Array = None
     voltage: Array = None
+    body_rate: Array = None
+    body_acceleration: Array = None
+    rotor_thrust: Array = None
+    rotor_speed: Array = None
+    torque: Array = None
     tau: float = 0.0
     delay: float = 0.0
+    rate_lag: float = 0.0
+    rate_delay: float = 0.0
 
     @property
     def body_velocity(self) -> tuple[Array, Array, Array]:
@@ -79,7 +93,9 @@ class Parameter:
 
     `neutral` is the value without effect (or the name of the vehicle's field that holds it), `low` and `high` the
     physically plausible range, `typical` a size that matters in flight: the diagnosis asks whether a flight could
-    have shown an effect of that size, and fits start there.
+    have shown an effect of that size, and fits start there. `structural` marks a number that says where an effect
+    acts and not how much (the height of a ceiling): it is fitted, but no value of it is "no effect". `even` marks one
+    that acts by its square, so that its sign means nothing.
     """
 
     name: str
@@ -89,6 +105,8 @@ class Parameter:
     typical: float
     low: float
     high: float
+    structural: bool = False
+    even: bool = False
 
     def neutral_for(self, vehicle: Vehicle) -> float:
         """The value at which the effect does nothing beyond what the vehicle file already says."""
@@ -99,11 +117,16 @@ class Parameter:
 class Effect:
     """A physical effect, ready to fit, predict, diagnose, explain and export.
 
-    `needs` names the columns of `models.flight.COLUMNS` it reads; `with_any` the effects of which one must be in the
-    model for this one to act (wind acts through drag); `exports` is False for an effect with memory, which a static
-    correction cannot hold. `beyond` names simpler effects with which this one coincides unless the flight
-    varies what it depends on (a bent thrust curve in a hover is a thrust gain). `aliases` are physical quantities
-    that no flight can tell apart from this effect.
+    `needs` names the columns of `models.flight.COLUMNS` it reads, `needs_any` those of which one is enough;
+    `with_any` the effects of which one must be in the model for this one to act (wind acts through drag); `exports`
+    is False for an effect with memory, which a static correction cannot hold. `beyond` names simpler effects with
+    which this one coincides unless the flight varies what it depends on (a bent thrust curve in a hover is a thrust
+    gain). `aliases` are physical quantities that no flight can tell apart from this effect. `unconfounded` is the
+    reason why an effect has no confounder. `rotational` effects are found in the angular acceleration; `seen_as`
+    names the effects that such a one is taken for where the flight lacks the columns to tell. `one_of` is True where
+    at most one of the parameters acts (the one rotor that is damaged): each is then a candidate on its own.
+    `typical_for` gives sizes that depend on where the flight went (a ceiling just above its highest point) instead of
+    the parameters' own.
     """
 
     name: str
@@ -119,11 +142,29 @@ class Effect:
     aliases: tuple[str, ...] = ()
     beyond: tuple[str, ...] = ()
     exports: bool = True
+    needs_any: tuple[str, ...] = ()
+    unconfounded: str = ""
+    rotational: bool = False
+    seen_as: tuple[str, ...] = ()
+    one_of: bool = False
+    typical_for: Callable[[Motion], Mapping[str, float]] | None = None
 
     def apply(self, motion: Motion, values: Mapping[str, Any]) -> Motion:
         """The motion with this effect acting; `values` by parameter name."""
         return self.formula(motion, **{p.name: values[p.name] for p in self.parameters})
 
+    def lacks(self, flight: Flight) -> tuple[str, ...]:
+        """The columns it needs and the flight does not have."""
+        missing = [n for n in self.needs if not flight.has(n)]
+        if self.needs_any and not any(flight.has(n) for n in self.needs_any):
+            missing.append(" or ".join(self.needs_any))
+        return tuple(missing)
+
     def neutral(self, vehicle: Vehicle) -> dict[str, float]:
         """Parameter values at which the effect does nothing."""
         return {p.name: p.neutral_for(vehicle) for p in self.parameters}
+
+    def typical(self, motion: Motion) -> dict[str, float]:
+        """Parameter values of a size that matters, on this flight."""
+        sizes = {p.name: p.typical for p in self.parameters}
+        return sizes if self.typical_for is None else {**sizes, **self.typical_for(motion)}

@@ -13,6 +13,7 @@ import onnx
 import torch
 
 from models import contract
+from models.effect import Stage
 from models.export_graph import simplify
 from models.features import feature_matrix, feature_names, features_of_flight
 from models.flight import Flight
@@ -36,7 +37,7 @@ class Correction(torch.nn.Module):
         self.chain = [
             (effect, {k: float(v) for k, v in values.items()})
             for effect, values in model.effect_chain()
-            if effect.exports and effect.name != "accelerometer_bias"
+            if effect.exports and effect.stage is not Stage.SENSOR
         ]
         self.network: torch.nn.Module | None = None
         if model.network is not None:
@@ -72,7 +73,7 @@ LOOKED_OVER = ("transport_delay", "motor_lag")
 
 def not_exported(model: Model) -> tuple[str, ...]:
     """Effects of the model that a vehicle cannot correct: other ones with memory, and errors of the sensor."""
-    held = [e for e, _ in model.effect_chain() if not e.exports or e.name == "accelerometer_bias"]
+    held = [e for e, _ in model.effect_chain() if not e.exports or e.stage is Stage.SENSOR]
     return tuple(e.name for e in held if e.name not in LOOKED_OVER)
 
 

@@ -1,7 +1,11 @@
-"""From a flight (or a table of features) to predicted acceleration, through a chain of effects."""
+"""From a flight (or a table of features) to predicted acceleration, through a chain of effects.
+
+Two readings of one motion: the specific force that acts, and, from each rotor's thrust, the torque on the body.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -40,6 +44,11 @@ def motion_of_flight(flight: Flight) -> Motion:
         changes["height"] = flight.position[:, 2]
     if flight.battery_voltage is not None:
         changes["voltage"] = flight.battery_voltage
+    if flight.angular_velocity is not None:
+        changes["body_rate"] = flight.angular_velocity
+        changes["body_acceleration"] = derivative(flight.angular_velocity, flight.t)
+    if (thrust := rotor_thrust(flight)) is not None:
+        changes |= {"rotor_thrust": thrust, "rotor_speed": flight.rotor_speed}
     return Motion(
         vehicle=flight.vehicle,
         dt=flight.dt,
@@ -51,6 +60,40 @@ def motion_of_flight(flight: Flight) -> Motion:
         delay=flight.vehicle.command_delay,
         **changes,
     )
+
+
+def derivative(column: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Central difference of a column (N, k) over `t` (N,) s that reaches across no gap."""
+    period = float(np.median(np.diff(t)))
+    edges = [0, *(np.flatnonzero(np.diff(t) > 3.0 * period) + 1).tolist(), len(t)]
+    out = np.zeros_like(column)
+    for start, stop in itertools.pairwise(edges):
+        if stop - start > 1:
+            out[start:stop] = np.gradient(column[start:stop], period, axis=0)
+    return out
+
+
+def rotor_thrust(flight: Flight) -> np.ndarray | None:
+    """Thrust (N, 4) of each rotor in N as its speed tells, or else its motor command; None where the flight has
+    neither.
+
+    What thrust a rotor speed gives is not in a vehicle file: its mean over the flight is taken from the accelerometer's
+    mean, or from the weight where there is none.
+    """
+    vehicle = flight.vehicle
+    count = len(vehicle.rotor_positions)
+    if flight.rotor_speed is not None and flight.rotor_speed.shape[1] == count:
+        squares = np.nan_to_num(flight.rotor_speed) ** 2
+    elif flight.motor_command is not None and flight.motor_command.shape[1] == count:
+        squares = vehicle.thrust(np.nan_to_num(flight.motor_command)) / count
+    else:
+        return None
+    flying = slice(None) if flight.flying is None else flight.flying
+    mean = float(np.mean(squares[flying].sum(axis=1)))
+    felt = 0.0
+    if flight.specific_force is not None:
+        felt = vehicle.mass * float(np.mean(flight.specific_force[flying, 2]))
+    return squares * ((felt if felt > 0.0 else vehicle.weight) / mean) if mean > 0.0 else None
 
 
 def motion_of_features(columns: Mapping[str, Array], vehicle: Vehicle) -> Motion:
@@ -99,6 +142,12 @@ def act(motion: Motion, chain: Chain) -> Motion:
         motion = effect.apply(motion, values)
     if motion.euler is not None:
         motion = motion.with_(thrust_acceleration=linear_thrust(motion))
+    if motion.torque is not None:
+        motion = motion.with_(torque=rotor_torque(motion))
+        for effect, values in at[Stage.TORQUE]:
+            motion = effect.apply(motion, values)
+    for effect, values in at[Stage.RATE]:
+        motion = effect.apply(motion, values)
     stages = (Stage.ROTATION, Stage.REMAINDER, Stage.AIR, Stage.FORCE, Stage.SENSOR)
     # without attitude there is nothing to rotate: thrust is compared along the body's axis
     for stage in stages if motion.euler is not None else stages[1:]:
@@ -123,6 +172,20 @@ def linear_thrust(motion: Motion) -> Array:
     return acceleration + xp.stack(
         [0.0 * motion.thrust, 0.0 * motion.thrust, 0.0 * motion.thrust + GRAVITY], axis=-1
     )
+
+
+def rotor_torque(motion: Motion) -> Array:
+    """Torque (N, 3) of the rotors' thrusts about the believed centre of mass, body axes, N m.
+
+    About z it is the drag torque of the rotors over the length that relates it to thrust, which no vehicle file tells.
+    """
+    xp = array_namespace(motion.rotor_thrust)
+    roll = pitch = yaw = 0.0 * motion.rotor_thrust[:, 0]
+    rotors = zip(motion.vehicle.rotor_positions, motion.vehicle.rotor_directions, strict=True)
+    for i, ((x, y, _), direction) in enumerate(rotors):
+        thrust = motion.rotor_thrust[:, i]
+        roll, pitch, yaw = roll + y * thrust, pitch - x * thrust, yaw - float(direction) * thrust
+    return xp.stack([roll, pitch, yaw], axis=-1)
 
 
 def to_heading(motion: Motion, body: Array) -> Array:

@@ -27,6 +27,7 @@ _RANGES = {
     "nominal_voltage": (1.0, 1000.0, "V"),
     "command_delay": (0.0, 0.5, "s"),
     "motor_time_constant": (0.0, 1.0, "s"),
+    "rate_time_constant": (0.0, 1.0, "s"),
 }
 
 
@@ -37,9 +38,10 @@ class Vehicle:
     World ENU, body FLU, SI units. `rotor_positions` (4, 3) in m from the centre of mass; `rotor_directions` (4,)
     is +1 for a rotor that turns counter-clockwise seen from above; `hover_thrust` is the normalised collective
     command that holds a hover at `nominal_voltage`; `command_delay` and `motor_time_constant` in s are what is
-    known about the path from command to thrust. `rotor_height` in m is that of the rotors above the ground where the
-    recorded z is 0: a companion's z is 0 where the vehicle stands. `thrust_model` is the assumed map from normalised
-    command u to thrust in N: "linear" `m g u / hover_thrust`, "quadratic" `m g (u / hover_thrust)²`.
+    known about the path from command to thrust, `rate_time_constant` in s about the closed loop of the body rates
+    (0: nothing). `rotor_height` in m is that of the rotors above the ground where the recorded z is 0: a companion's z
+    is 0 where the vehicle stands. `thrust_model` is the assumed map from normalised command u to thrust in N: "linear"
+    `m g u / hover_thrust`, "quadratic" `m g (u / hover_thrust)²`.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Vehicle:
     command_delay: float = 0.0
     motor_time_constant: float = 0.0
     rotor_height: float = 0.0
+    rate_time_constant: float = 0.0
     source: str = field(default="", compare=False)
 
     @property

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
+import numpy as np
 
+from models.frames import rotation_matrix
 from models.vehicle import Vehicle
 from sim_bridge.rates import RateController
 from sim_bridge.truth.airframe import believed_powertrain
@@ -63,6 +66,9 @@ class Simulator:
         self._line = [(0.0, 0.0, 0.0, 0.0)] * (whole + 2)
         self._whole = whole
         self._cursor = 0
+        tau = powertrain.rate_filter
+        self._filter = math.exp(-PHYSICS_STEP / tau) if tau > 0.0 else 0.0
+        self._asked = (0.0, 0.0, 0.0)
         self._estimate: Estimate | None = None
         self._reported: Estimate | None = None
         # Samples on their way to the companion, oldest first; none are kept where it is told at once.
@@ -117,6 +123,9 @@ class Simulator:
             p1 += late * (p0 - p1)
             q1 += late * (q0 - q1)
             r1 += late * (r0 - r1)
+        if old := self._filter:
+            p0, q0, r0 = self._asked
+            self._asked = p1, q1, r1 = p1 + old * (p0 - p1), q1 + old * (q0 - q1), r1 + old * (r0 - r1)
         velocity = self._velocity.tolist()
         _, _, _, wx, wy, wz = velocity
         self.motors = motors = self.rates.motors(c1, p1, q1, r1, wx, wy, wz)
@@ -135,6 +144,7 @@ class Simulator:
         self._cursor = (self._cursor + 1) % len(self._line)
         self._line[self._cursor] = (0.0, 0.0, 0.0, 0.0)
         self.rates.reset()
+        self._asked = (0.0, 0.0, 0.0)
         world = self.world
         self.airframe.act(world.position.tolist(), world.velocity.tolist(), self.motors, world.wrench)
         world.step()
@@ -167,15 +177,31 @@ class Simulator:
         m = self.airframe.motion
         velocity = self._velocity.tolist()
         rate = 1.0 / PHYSICS_STEP
+        ax, ay, az = (velocity[0] - m.vx) * rate, (velocity[1] - m.vy) * rate, (velocity[2] - m.vz) * rate
+        if self.sensors.lever_arm is not None:
+            bx, by, bz = self._swing(velocity, self.sensors.lever_arm)
+            ax, ay, az = ax + bx, ay + by, az + bz
         return (
             self.time_us,
             self._position.tolist(),
             velocity,
-            ((velocity[0] - m.vx) * rate, (velocity[1] - m.vy) * rate, (velocity[2] - m.vz) * rate),
+            (ax, ay, az),
             (m.r00, m.r01, m.r02, m.r10, m.r11, m.r12, m.r20, m.r21, m.r22),
             m.voltage,
             tuple(m.speeds),
         )
+
+    def _swing(self, velocity: list[float], arm: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Acceleration (world, m/s²) of a point of the body against its centre of mass, over the last step."""
+        m = self.airframe.motion
+        x, y, z = arm
+        before = np.array([m.q * z - m.r * y, m.r * x - m.p * z, m.p * y - m.q * x])
+        turned = np.array([[m.r00, m.r01, m.r02], [m.r10, m.r11, m.r12], [m.r20, m.r21, m.r22]])
+        p, q, r = velocity[3:]
+        after = np.array([q * z - r * y, r * x - p * z, p * y - q * x])
+        now = rotation_matrix(np.array(self._position.tolist()[3:]))
+        a, b, c = ((now @ after - turned @ before) / PHYSICS_STEP).tolist()
+        return a, b, c
 
     def _fly_on(self) -> None:
         """Let happen what happens at a time after take-off; the clock starts when the vehicle leaves the

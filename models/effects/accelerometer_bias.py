@@ -23,5 +23,5 @@ EFFECT = Effect(
     needs=("specific_force",),
     manoeuvre="hover at several headings, and tilts both ways",
     citation="IEEE Std 1293, bias term of the accelerometer model; range: 80 mg zero-g offset of MEMS data sheets",
-    confounded_with=("thrust_gain", "thrust_curve", "wind"),
+    confounded_with=("thrust_gain", "thrust_curve", "wind", "thrust_misalignment"),
 )

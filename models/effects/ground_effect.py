@@ -30,7 +30,7 @@ EFFECT = Effect(
     title="thrust rises near the ground",
     stage=Stage.THRUST,
     formula=formula,
-    parameters=(Parameter("rho", "1", "multiplier of the rotor radius", 0.0, 1.2, 0.0, 6.0),),
+    parameters=(Parameter("rho", "1", "multiplier of the rotor radius", 0.0, 1.2, 0.0, 6.0, even=True),),
     needs=("quaternion", "position", "thrust_command"),
     manoeuvre="slow passes and hovers at heights from half a rotor radius above the ground to five radii",
     citation="Cheeseman & Bennett 1955; Danjun et al. 2015; Sanchez-Cuevas et al. 2017 (quadrotors)",

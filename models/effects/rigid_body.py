@@ -17,4 +17,5 @@ EFFECT = Effect(
     needs=("quaternion", "thrust_command"),
     manoeuvre="any flight with tilt above about ten degrees",
     citation="Newton-Euler equations; Carvalho et al. 2022, eq. (1)-(3)",
+    unconfounded="it has no parameter: nothing is fitted",
 )

@@ -17,6 +17,6 @@ EFFECT = Effect(
     needs=("thrust_command",),
     manoeuvre="hover, then climbs and descents at two or more accelerations",
     citation="F = m a: specific thrust is c u / m, so a payload, the mass and the thrust constant are one number",
-    confounded_with=("thrust_curve", "battery_sag", "accelerometer_bias"),
+    confounded_with=("thrust_curve", "battery_sag", "accelerometer_bias", "rotor_damage"),
     aliases=("mass", "payload", "thrust constant"),
 )

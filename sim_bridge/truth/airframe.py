@@ -32,7 +32,8 @@ class Powertrain:
 
     `thrust_constants` in N s² (thrust over rotor speed squared), `torque_per_thrust` in m, `hover_speed` in
     rad/s. `speed_blend` is the share of the other curve in the map from command to rotor speed (0: as
-    believed). `time_constant` of rotor speed and `delay` from setpoint to motors in s.
+    believed). `time_constant` of rotor speed, `delay` from setpoint to motors and `rate_filter`, the time constant
+    of a filter on the commanded body rates, in s.
     """
 
     thrust_constants: tuple[float, float, float, float]
@@ -44,6 +45,7 @@ class Powertrain:
     time_constant: float
     delay: float
     battery: BatteryCell
+    rate_filter: float = 0.0
 
 
 def believed_powertrain(vehicle: Vehicle) -> Powertrain:

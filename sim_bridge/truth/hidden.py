@@ -57,6 +57,8 @@ class Effect:
     most: float = math.inf
     drawn: bool = True
     """Whether `random` may draw it."""
+    any_draws: bool | None = None
+    """Whether `any` may draw it; None: as `random` does."""
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """All parameters, drawn, or around a given size."""
@@ -426,6 +428,273 @@ class Payload(Effect):
         return numbers["time"], lambda world: world.load(mass, inertia)
 
 
+@register
+class TranslationalLift(Effect):
+    """Blade elements of a rotor in edgewise flow meet faster air on one side than they miss on the other.
+
+    Averaged over a turn the square of a blade element's airspeed grows by half the square of the edgewise airspeed:
+    thrust rises by the square of the airspeed at the hub, whatever the rotor's speed (Leishman, "Principles of
+    Helicopter Aerodynamics", ch. 3).
+    """
+
+    name, what = (
+        "translational_lift",
+        "each rotor's thrust rises with the square of the airspeed in its plane",
+    )
+    low, high, most, drawn, any_draws = 0.03, 0.08, 0.5, False, True
+    units: ClassVar = {"lift": "1/m"}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """A quarter of the gain at every hub, with the velocity that the body's rates give the hub."""
+        gain = 0.25 * airframe.vehicle.mass * numbers["lift"]
+        hubs = tuple(airframe.vehicle.rotor_positions)
+
+        def act(m: Motion) -> None:
+            u, v, p, q, r = m.u, m.v, m.p, m.q, m.r
+            thrusts = m.thrusts
+            for i, (x, y, z) in enumerate(hubs):
+                hx, hy = u + q * z - r * y, v + r * x - p * z
+                thrusts[i] += gain * (hx * hx + hy * hy)
+
+        airframe.on_rotors.append(act)
+
+
+@register
+class CeilingEffect(Effect):
+    """A ceiling above the flight draws each rotor up.
+
+    Law and constants of Sanchez-Cuevas, Heredia and Ollero, "Multirotor UAS for bridge inspection by contact using
+    the ceiling effect", ICUAS 2017: thrust over 1 - (R / (d + 0.0378 m))² / 6.924, with the effective radius R.
+    """
+
+    name, what = "ceiling_effect", "each rotor's thrust rises near a ceiling above the flight"
+    low, high, most, drawn, any_draws = 2.0, 3.0, 6.0, False, False
+    units: ClassVar = {"radius_factor": "1", "height": "m"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """An effective radius, below a ceiling just above the survey flight's highest hover."""
+        drawn = generator.uniform(self.low, self.high)
+        height = generator.uniform(2.78, 2.85)
+        return {"radius_factor": drawn if size is None else size, "height": height}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """Each hub by its own distance."""
+        hubs = tuple(airframe.vehicle.rotor_positions)
+        square = (numbers["radius_factor"] * airframe.vehicle.rotor_radius) ** 2 / 6.924
+        height = numbers["height"]
+
+        def act(m: Motion) -> None:
+            z, r20, r21, r22 = m.z, m.r20, m.r21, m.r22
+            thrusts = m.thrusts
+            for i, (x, y, up) in enumerate(hubs):
+                distance = height - (z + r20 * x + r21 * y + r22 * up)
+                near = square / (max(distance, 0.0) + 0.0378) ** 2
+                thrusts[i] /= 1.0 - (near if near < 0.5 else 0.5)
+
+        airframe.on_rotors.append(act)
+
+
+@register
+class VortexRing(Effect):
+    """A rotor that sinks into its own wake loses thrust.
+
+    A raised cosine over the descent speed of each hub, from 0.3 to 1.5 of the hover's induced velocity, as the loss of
+    small propellers measured by Shetty and Selig, AIAA 2011-1254; gone at edgewise speeds above the induced velocity.
+    """
+
+    name, what = "vortex_ring", "each rotor loses thrust where it sinks nearly as fast as its own wake"
+    low, high, most, drawn, any_draws = 0.15, 0.35, 0.8, False, False
+    units: ClassVar = {"loss": "1"}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """Thrust of rotor i times one minus the loss."""
+        vehicle = airframe.vehicle
+        disc = math.pi * vehicle.rotor_radius**2
+        induced = math.sqrt(0.25 * vehicle.weight / (2.0 * AIR_DENSITY * disc))
+        hubs, loss = tuple(vehicle.rotor_positions), numbers["loss"]
+
+        def act(m: Motion) -> None:
+            u, v, w, p, q = m.u, m.v, m.w, m.p, m.q
+            edgewise = sqrt(u * u + v * v) / induced
+            if edgewise >= 1.0:
+                return
+            thrusts = m.thrusts
+            for i, (x, y, _) in enumerate(hubs):
+                sinking = -(w + p * y - q * x) / induced
+                if 0.3 < sinking < 1.5:
+                    ring = 0.5 - 0.5 * math.cos(2.0 * math.pi * (sinking - 0.3) / 1.2)
+                    thrusts[i] *= 1.0 - loss * ring * (1.0 - edgewise)
+
+        airframe.on_rotors.append(act)
+
+
+@register
+class ThrustMisalignment(Effect):
+    """Rotors are mounted with a common tilt against the autopilot."""
+
+    name, what = "thrust_misalignment", "every rotor's axis leans by the same angle against the body"
+    low, high, most, drawn, any_draws = 0.02, 0.05, 0.3, False, True
+    units: ClassVar = {"angle": "rad", "x": "rad", "y": "rad"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """An angle in any direction."""
+        angle, direction = generator.uniform(self.low, self.high), generator.uniform(-math.pi, math.pi)
+        angle = angle if size is None else size
+        return {"angle": angle, "x": angle * math.cos(direction), "y": angle * math.sin(direction)}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """The force of each rotor along its leaning axis, and its torque at the hub."""
+        sx, sy = math.sin(numbers["x"]), math.sin(numbers["y"])
+        short = 1.0 - sqrt(1.0 - sx * sx - sy * sy)
+        hubs = tuple(airframe.vehicle.rotor_positions)
+
+        def act(m: Motion) -> None:
+            body = m.wrench
+            for thrust, (x, y, z) in zip(m.thrusts, hubs, strict=True):
+                fx, fy, fz = sx * thrust, sy * thrust, -short * thrust
+                body[0] += fx
+                body[1] += fy
+                body[2] += fz
+                body[3] += y * fz - z * fy
+                body[4] += z * fx - x * fz
+                body[5] += x * fy - y * fx
+
+        airframe.on_body.append(act)
+
+
+@register
+class ImuLeverArm(Effect):
+    """The accelerometer sits away from the centre of mass and reads the acceleration of where it sits."""
+
+    name, what = "imu_lever_arm", "the accelerometer sits away from the centre of mass"
+    low, high, most, drawn, any_draws = 0.03, 0.07, 0.5, False, True
+    units: ClassVar = {"length": "m", "x": "m", "y": "m", "z": "m"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """A distance in any direction."""
+        drawn = generator.uniform(self.low, self.high)
+        size = drawn if size is None else size
+        axis = [generator.gauss(0.0, 1.0) for _ in range(3)]
+        length = math.sqrt(sum(a * a for a in axis))
+        x, y, z = (size * a / length for a in axis)
+        return {"length": size, "x": x, "y": y, "z": z}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """Where the accelerometer is; the simulator differentiates that point's velocity."""
+        sensors.lever_arm = (numbers["x"], numbers["y"], numbers["z"])
+
+
+@register
+class CentreOfMassOffset(Effect):
+    """The battery slipped: the centre of mass is not where the rotors' positions are measured from."""
+
+    name, what = (
+        "com_offset",
+        "the centre of mass is off the rotors' centre, so that thrust turns the vehicle",
+    )
+    low, high, most, drawn, any_draws = 0.004, 0.010, 0.2, False, True
+    units: ClassVar = {"distance": "m", "x": "m", "y": "m"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """A distance in any direction of the rotors' plane."""
+        drawn, direction = generator.uniform(self.low, self.high), generator.uniform(-math.pi, math.pi)
+        size = drawn if size is None else size
+        return {"distance": size, "x": size * math.cos(direction), "y": size * math.sin(direction)}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """Every rotor's arm is shorter by the offset."""
+        cx, cy = numbers["x"], numbers["y"]
+
+        def act(m: Motion) -> None:
+            body = m.wrench
+            for thrust in m.thrusts:
+                body[3] += -cy * thrust
+                body[4] -= -cx * thrust
+
+        airframe.on_body.append(act)
+
+
+@register
+class RotorDamage(Effect):
+    """A chipped propeller: one rotor gives less thrust, and drags less, at the same speed."""
+
+    name, what = "rotor_damage", "one rotor gives less thrust than the others at the same speed"
+    low, high, most, drawn, any_draws = 0.08, 0.16, 0.7, False, True
+    units: ClassVar = {"loss": "1", "rotor": "1"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """A share of the thrust of any one rotor, 1 to 4."""
+        drawn, rotor = generator.uniform(self.low, self.high), generator.randint(1, 4)
+        return {"loss": drawn if size is None else size, "rotor": float(rotor)}
+
+    def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
+        """Its thrust constant is smaller."""
+        constants = list(train.thrust_constants)
+        constants[round(numbers["rotor"]) - 1] *= 1.0 - numbers["loss"]
+        a, b, c, d = constants
+        return replace(train, thrust_constants=(a, b, c, d))
+
+
+@register
+class RateLoopLag(Effect):
+    """The autopilot filters the commanded body rates."""
+
+    name, what = "rate_loop_lag", "body rates follow their command through a further lag"
+    low, high, most, drawn, any_draws = 0.06, 0.09, 1.0, False, True
+    units: ClassVar = {"time_constant": "s"}
+
+    def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
+        """The filter's time constant."""
+        return replace(train, rate_filter=numbers["time_constant"])
+
+
+@register
+class Gyroscopic(Effect):
+    """Rotors have angular momentum: turning their axes and changing their speed takes torque from the body.
+
+    The momentum of all rotors along the body's z axis, J sum s_i W_i, changes with the body's rates and with the
+    rotors' speeds; the body gets the opposite (Newton-Euler; Bouabdallah 2007, thesis EPFL 3727).
+    """
+
+    name, what = (
+        "gyroscopic",
+        "the rotors' angular momentum couples roll and pitch, and their spin-up turns the body",
+    )
+    low, high, most, drawn, any_draws = 1.5e-5, 4e-5, 1.0, False, False
+    units: ClassVar = {"inertia": "kg m^2"}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """Minus the change of momentum as seen from the body."""
+        inertia, directions = numbers["inertia"], tuple(airframe.vehicle.rotor_directions)
+        rate = 1.0 / airframe.dt
+        before: list[float] = []
+
+        def act(m: Motion) -> None:
+            momentum = inertia * sum(s * w for s, w in zip(directions, m.speeds, strict=True))
+            spin_up = (momentum - before[0]) * rate if before else 0.0
+            before[:] = [momentum]
+            body = m.wrench
+            body[3] -= m.q * momentum
+            body[4] += m.p * momentum
+            body[5] -= spin_up
+
+        airframe.on_body.append(act)
+
+
 RICH: dict[str, tuple[float, float]] = {
     "rotor_drag": (0.40, 0.60),
     "parasitic_drag": (0.01, 0.03),
@@ -465,11 +734,19 @@ def rich(vehicle: Vehicle, seed: int) -> tuple[Hidden, ...]:
     return tuple(hidden)
 
 
+def pool(request: str) -> list[str]:
+    """Names of the effects that `random` or `any` draws from."""
+    if request == "random":
+        return [name for name, effect in EFFECTS.items() if effect.drawn]
+    return [n for n, e in EFFECTS.items() if (e.drawn if e.any_draws is None else e.any_draws)]
+
+
 def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> tuple[Hidden, ...]:
     """What to hide, from `NAME`, `NAME:SIZE`, `none`, `random` or `rich` requests; the same seed hides the same.
 
-    `random` draws `count` different effects, `rich` is that of `rich()`; what follows it may override a part of
-    it. Raises `InputError` for an unknown name or a size out of range.
+    `random` draws `count` different effects of the first catalogue, `any` of all that act for a whole flight (so
+    that a seed of `random` hides for ever what it hid), `rich` is that of `rich()`; what follows it may override a
+    part of it. Raises `InputError` for an unknown name or a size out of range.
     """
     chosen: dict[str, Hidden] = {}
     for request in requests:
@@ -477,11 +754,13 @@ def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> 
             if len(requests) > 1:
                 raise InputError("--hidden none cannot be combined with another --hidden; drop one of them")
             return ()
-        if request == "random":
-            drawable = [name for name, effect in EFFECTS.items() if effect.drawn]
+        if request in ("random", "any"):
+            drawable = pool(request)
             if not 1 <= count <= len(drawable):
                 raise InputError(f"--hidden-count {count} must be 1 to {len(drawable)}")
-            generator = random.Random(f"trueflight {seed}")
+            generator = random.Random(
+                f"trueflight {seed}" if request == "random" else f"trueflight any {seed}"
+            )
             for name in generator.sample(drawable, count):
                 chosen[name] = _make(name, None, vehicle, seed)
             continue
@@ -490,7 +769,7 @@ def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> 
             continue
         name, colon, text = request.partition(":")
         if name not in EFFECTS:
-            known = [*EFFECTS, "rich", "random", "none"]
+            known = [*EFFECTS, "rich", "random", "any", "none"]
             close = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
             raise InputError(f"--hidden {request}: unknown effect '{name}'; {hint}")

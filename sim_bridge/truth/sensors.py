@@ -58,13 +58,14 @@ _BLOCK, _DRAWS = 1024, 25
 class Sensors:
     """Draws every sample's errors from one seeded generator.
 
-    `accelerometer_bias` (m/s², body) and `delay` (s, from a moment to its sample's arrival at a companion) are
-    hidden effects.
+    `accelerometer_bias` (m/s², body), `lever_arm` (m, of the accelerometer from the centre of mass, body) and `delay`
+    (s, from a moment to its sample's arrival at a companion) are hidden effects.
     """
 
     def __init__(self, noise: Noise, seed: int) -> None:
         self.noise = noise
         self.accelerometer_bias = (0.0, 0.0, 0.0)
+        self.lever_arm: tuple[float, float, float] | None = None
         self.delay = 0.0
         self._generator = np.random.default_rng([seed, 0x5E45])
         self._rows: list[list[float]] = []
@@ -84,8 +85,8 @@ class Sensors:
         """One sample. `position` is x, y, z, quaternion and `velocity` linear (world) and angular (body), as
         in `World`.
 
-        `acceleration` (world, m/s²) and `rotation` (nine numbers, body to world) belong to the step that has
-        just been made, so that the specific force is the one that acted in it.
+        `acceleration` (of where the accelerometer is, world, m/s²) and `rotation` (nine numbers, body to world) belong
+        to the step that has just been made, so that the specific force is the one that acted in it.
         """
         if not self._rows:
             # Drawn in blocks: one call for a thousand samples costs less than one call for each number.

@@ -1,0 +1,95 @@
+"""A user's effect, one file from the template, gets all that the catalogue's own effects get."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+
+from groundstation.effect_commands import write_template
+from groundstation.reading import read_flight
+from groundstation.reading.writing import write_flight
+from models.errors import InputError
+from models.frames import rotate_inverse
+
+BIN = Path(sys.executable).parent
+SAMPLE = Path(__file__).parents[2] / "samples" / "rotorpy" / "nothing_hidden" / "identify.parquet"
+PULL = 0.3
+
+
+@pytest.fixture(scope="module")
+def flight_with_tether(tmp_path_factory) -> Path:
+    """A flight of another simulator to which plain vector algebra adds the weight of a tether."""
+    flight = read_flight(SAMPLE)
+    weight = np.outer(-PULL * flight.position[:, 2], [0.0, 0.0, 1.0])
+    pulled = replace(flight, specific_force=flight.specific_force + rotate_inverse(flight.quaternion, weight))
+    path = tmp_path_factory.mktemp("tether") / "flight.csv"
+    write_flight(pulled, path)
+    return path
+
+
+def run(*arguments: object) -> str:
+    command = [str(BIN / "python"), "-m", "groundstation.cli", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_template_is_ranked_fitted_added_and_exported(flight_with_tether: Path, tmp_path) -> None:
+    effects, store = tmp_path / "mine", tmp_path / "store"
+    run("effect", "new", "tether", "--output", effects)
+    vehicle = flight_with_tether.with_suffix(".vehicle.toml")
+    common = ("--vehicle", vehicle, "--effects", effects, "--store", store, "--json")
+
+    diagnosis = json.loads(run("diagnose", flight_with_tether, *common))
+    (found,) = [e for e in diagnosis["effects"] if e["verdict"] in ("missing", "possible")]
+    assert (found["name"], found["verdict"], found["rank"]) == ("tether", "missing", 1)
+    pull = found["parameters"]["pull"]
+    assert pull["low"] <= PULL <= pull["high"]
+    assert pull["unit"] == "1/s^2"
+
+    recording = tmp_path / "tether.rrd"
+    added = json.loads(
+        run("model", "add", "tether", "--flight", flight_with_tether, "--rrd", recording, *common)
+    )
+    assert added["waterfall"][-1]["fitted"] < 0.8 * added["waterfall"][-2]["fitted"]
+    assert recording.stat().st_size > 1000
+
+    graph = tmp_path / "tether.onnx"
+    exported = run(
+        *("model", "export", "v1", "--flight", flight_with_tether, "--vehicle", vehicle, "--store", store),
+        *("-o", graph, "--json"),
+    )
+    assert json.loads(exported)["not_exported"] == []
+    session = onnxruntime.InferenceSession(graph.read_bytes())
+    hover = np.array([[2.0, 1, 0, 1, 0, 0, 0, 0, 16.0, 0.0]], dtype=np.float32)
+    higher = hover.copy()
+    higher[0, 0] = 3.0
+    delta = [session.run(None, {"features": f})[0][0] for f in (hover, higher)]
+    np.testing.assert_allclose(delta[1] - delta[0], [0, 0, -pull["value"]], atol=1e-3)
+
+
+def test_template_is_listed_with_its_formula(tmp_path) -> None:
+    write_template("tether", tmp_path)
+    (told,) = json.loads(run("effects", "tether", "--effects", tmp_path, "--json"))
+    assert "a = -pull h z" in told["formula"]
+    assert told["parameters"]["pull"]["unit"] == "1/s^2"
+
+
+@pytest.mark.parametrize("name", ["Tether", "my tether", "../x", "rotor_drag", ""])
+def test_a_name_that_cannot_be_is_refused(tmp_path, name: str) -> None:
+    with pytest.raises(InputError, match=r"choose another name|use lower-case"):
+        write_template(name, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_effect_of_ones_own_is_never_overwritten(tmp_path) -> None:
+    path = write_template("tether", tmp_path)
+    path.write_text("mine")
+    with pytest.raises(InputError, match="exists already"):
+        write_template("tether", tmp_path)
+    assert path.read_text() == "mine"
