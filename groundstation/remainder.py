@@ -2,10 +2,10 @@
 
 The learner is ridge regression on an additive spline basis, all products of two variables, and a smooth map of the
 place (random Fourier features, Rahimi & Recht 2007), scored block by block on what it did not see. Being linear in its
-targets, it learns two hundred made-up residuals as fast as one: residuals of the same spectrum with random phases
-(Prichard & Theiler 1994: all axes alike), which know nothing of the variables however slowly they wander, and
-residuals whose every half second changes sign at random, which keep bursts where they are. Structure counts only where the real
-residual is predicted better than all but one in a hundred of each kind.
+targets, it learns two hundred made-up residuals nearly as fast as one: residuals of the same spectrum with random
+phases, which know nothing of the variables however slowly they wander, and residuals whose sign changes at random,
+which keep bursts where they are. Structure counts only where the real residual is predicted better than all but one in
+a hundred of each kind.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from groundstation.measurement import Measurement
 from groundstation.results import SpectralLine, Unexplained
 from groundstation.sparse import sparse_formula
 from groundstation.spectrum import spectral_lines
+from groundstation.surrogates import BURST, random_phases, random_signs
 from models.frames import euler_from_quaternion, rotate_inverse
 
 SHARE = 0.05
@@ -36,8 +37,6 @@ FOLDS = 20
 BIN = 0.05
 """s over which the residual is averaged before it is learnt: what is faster than 10 Hz is left to the spectrum."""
 MOST_BINS = 6000
-BURST = 0.5
-"""s of residual that keep their sign together when signs are drawn: slower wander is kept by the random phases."""
 PENALTIES = (0.003, 0.03, 0.3)
 """Of the ridge, in units of the features' own variance; the best is taken, for made-up residuals as well."""
 PLACE_FEATURES = 40
@@ -67,15 +66,16 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
             advice=_advice_on_lines(heard) if heard else "",
         )  # fmt: skip
     variables = study.importance()
-    where = tuple(
+    goes_with = tuple(
         f"{name} ({part:.0%} of the remaining error goes with it{study.at(name)})"
         for name, part in list(variables.items())[:3]
         if part > 0.01
     )
+    told = () if formula is None else (f"{formula.text} takes {formula.variance_share:.0%} of the remaining error",)
     return Unexplained(
         True,
         share,
-        (*where, *(_said(line) for line in heard)),
+        (*told, *goes_with, *(_said(line) for line in heard)),
         p,
         variables,
         study.axes(),
@@ -140,7 +140,7 @@ class _Study:
         rng = np.random.default_rng(0)
         burst = ((self.t - self.t[0]) / BURST).astype(int)
         worst = 0.0
-        for make in (_random_phases, _random_signs):
+        for make in (random_phases, random_signs):
             as_good, tried = 0, 0
             for count in (19, SURROGATES - 19):
                 made = make(self.residual, burst, count, rng)
@@ -175,7 +175,7 @@ class _Study:
                 )
                 worse.append(error - right)
             found[name] = float(np.mean(worse)) * self.count / self.total
-        return dict(sorted(((n, x) for n, x in found.items() if x > 0.0), key=lambda pair: -pair[1]))
+        return dict(sorted(((n, min(x, 1.0)) for n, x in found.items() if x > 0.0), key=lambda pair: -pair[1]))
 
     def axes(self) -> dict[str, float]:
         """Share of the structure on each body axis."""
@@ -306,24 +306,6 @@ def _ridge(gram: np.ndarray, penalty: float, rows: int) -> np.ndarray:
     ridge = penalty * np.diag(gram).copy()
     ridge[0] = 1e-9 * rows  # a constant is free
     return ridge
-
-
-def _random_phases(
-    residual: np.ndarray, burst: np.ndarray, count: int, rng: np.random.Generator
-) -> np.ndarray:
-    """(M, count, A): the residual's spectra and cross spectra, with random phases."""
-    spectrum = np.fft.rfft(residual, axis=0)
-    turn = np.exp(2j * np.pi * rng.random((len(spectrum), count)))
-    turn[0] = 1.0
-    return np.fft.irfft(spectrum[:, None, :] * turn[:, :, None], n=len(residual), axis=0)
-
-
-def _random_signs(
-    residual: np.ndarray, burst: np.ndarray, count: int, rng: np.random.Generator
-) -> np.ndarray:
-    """(M, count, A): the residual with the sign of each burst drawn anew."""
-    signs = rng.choice([-1.0, 1.0], (int(burst.max()) + 1, count))
-    return residual[:, None, :] * signs[burst][:, :, None]
 
 
 def _variables(m: Measurement) -> tuple[tuple[str, ...], np.ndarray]:

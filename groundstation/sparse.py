@@ -1,8 +1,8 @@
 """A short formula for what no effect explains, and the effect file that it becomes.
 
 Orthogonal forward selection (Chen, Billings & Luo 1989) over a library of physical terms, each on each body axis. A
-term stays if it explains more than the best of all terms explains of residuals with the same spectrum and random
-phases, and if it makes held-out blocks better. STLSQ, PySINDy's default, keeps terms by the size of their coefficient,
+term stays if it explains more than the best of all terms explains of made-up residuals, of both kinds that
+`groundstation.remainder` tells of, and if it makes held-out blocks better. STLSQ, PySINDy's default, keeps terms by the size of their coefficient,
 which says nothing under correlated residuals.
 """
 
@@ -18,6 +18,7 @@ from scipy import stats
 from groundstation.fitting import BLOCK
 from groundstation.measurement import Measurement
 from groundstation.results import FormulaTerm, SparseFormula
+from groundstation.surrogates import BURST, random_phases, random_signs
 from models.effect import Motion
 from models.errors import InputError
 from models.prediction import motion_of_flight
@@ -118,11 +119,12 @@ def sparse_formula(measurement: Measurement, residual: np.ndarray) -> SparseForm
     block = ((m.t[m.used] - m.t[0]) / BLOCK).astype(int)
     _, block = np.unique(block, return_inverse=True)
     total = float(np.sum(residual**2))
+    burst = ((m.t[m.used] - m.t[0]) / BURST).astype(int)
     # every axis has its mean in the fit: a constant is no structure
     chosen: list[tuple[int, int]] = []  # (axis column, term)
     error = total
     for _ in range(MOST_TERMS):
-        best = _next(library, residual, chosen)
+        best = _next(library, residual, burst, chosen)
         if best is None:
             break
         held_out = _held_out(library, residual, block, [*chosen, best])
@@ -154,29 +156,28 @@ def formula_text(terms: tuple[FormulaTerm, ...]) -> str:
 
 
 def _next(
-    library: np.ndarray, residual: np.ndarray, chosen: list[tuple[int, int]]
+    library: np.ndarray, residual: np.ndarray, burst: np.ndarray, chosen: list[tuple[int, int]]
 ) -> tuple[int, int] | None:
     """The term that explains most beside the chosen ones; None where chance explains as much."""
     rng = np.random.default_rng(3)
-    scores, surrogate_best = {}, np.zeros(SURROGATES)
-    lefts, bases = [], []
+    bases = []
     for a in range(residual.shape[1]):
         base = np.column_stack([np.ones(len(library)), *(library[:, k] for axis, k in chosen if axis == a)])
-        q, _ = np.linalg.qr(base)
-        bases.append(q)
-        lefts.append(residual[:, a] - q @ (q.T @ residual[:, a]))
-    spectra = np.fft.rfft(np.column_stack(lefts), axis=0)
-    turn = np.exp(2j * np.pi * rng.random((len(spectra), SURROGATES)))
-    for a, (left, q) in enumerate(zip(lefts, bases, strict=True)):
+        bases.append(np.linalg.qr(base)[0])
+    left = np.column_stack([residual[:, a] - q @ (q.T @ residual[:, a]) for a, q in enumerate(bases)])
+    made = [make(left, burst, SURROGATES, rng) for make in (random_phases, random_signs)]
+    scores: dict[tuple[int, int], float] = {}
+    by_chance = np.zeros((2, SURROGATES))
+    for a, q in enumerate(bases):
         free = library - q @ (q.T @ library)
         size = np.sqrt(np.sum(free**2, axis=0))
         free = free / np.where(size > 1e-6 * np.sqrt(np.sum(library**2, axis=0)) + 1e-12, size, np.inf)
-        made = np.fft.irfft(spectra[:, a, None] * turn, n=len(left), axis=0)
-        surrogate_best = np.maximum(surrogate_best, np.max((free.T @ made) ** 2, axis=0))
-        for k, score in enumerate((free.T @ left) ** 2):
+        for kind, columns in enumerate(made):
+            by_chance[kind] = np.maximum(by_chance[kind], np.max((free.T @ columns[:, :, a]) ** 2, axis=0))
+        for k, score in enumerate((free.T @ left[:, a]) ** 2):
             scores[(a, k)] = float(score)
     best = max(scores, key=lambda key: scores[key])
-    p = (1 + np.sum(surrogate_best >= scores[best])) / (1 + SURROGATES)
+    p = np.max(1 + np.sum(by_chance >= scores[best], axis=1)) / (1 + SURROGATES)
     return best if p <= ALPHA else None
 
 
