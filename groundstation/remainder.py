@@ -71,7 +71,11 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
         for name, part in list(variables.items())[:3]
         if part > 0.01
     )
-    told = () if formula is None else (f"{formula.text} takes {formula.variance_share:.0%} of the remaining error",)
+    told = (
+        ()
+        if formula is None
+        else (f"{formula.text} takes {formula.variance_share:.0%} of the remaining error",)
+    )
     return Unexplained(
         True,
         share,
@@ -102,7 +106,9 @@ def _advice_on_lines(lines: tuple[SpectralLine, ...]) -> str:
 def _advice(share: float, variables: dict[str, float], formula: bool) -> str:
     """What to do about structure that no effect explains."""
     if next(iter(variables), "") in ("east", "north"):
-        return "it goes with the place and not with the vehicle: look what is there (a fan, a wall, a draught)"
+        return (
+            "it goes with the place and not with the vehicle: look what is there (a fan, a wall, a draught)"
+        )
     if formula:
         return (
             "write the formula as an effect of your own: groundstation remainder FLIGHT --write DIR; or let a network "
@@ -175,7 +181,9 @@ class _Study:
                 )
                 worse.append(error - right)
             found[name] = float(np.mean(worse)) * self.count / self.total
-        return dict(sorted(((n, min(x, 1.0)) for n, x in found.items() if x > 0.0), key=lambda pair: -pair[1]))
+        return dict(
+            sorted(((n, min(x, 1.0)) for n, x in found.items() if x > 0.0), key=lambda pair: -pair[1])
+        )
 
     def axes(self) -> dict[str, float]:
         """Share of the structure on each body axis."""
@@ -284,8 +292,8 @@ def _weights(
 def _gains(features: np.ndarray, targets: np.ndarray, fold: np.ndarray) -> np.ndarray:
     """Squared error that learning takes away on held-out parts, for each penalty and target (P, R).
 
-    What a held-out part leaves is `(1 - H)^-1` times what the fit to everything leaves there, with that part's own block
-    of the hat matrix H (Allen 1974, PRESS, by blocks): one factorisation serves all parts and targets.
+    What a held-out part leaves is `(1 - H)^-1` times what the fit to everything leaves there, with that part's own
+    block of the hat matrix H (Allen 1974, PRESS, by blocks): one factorisation serves all parts and targets.
     """
     gains = np.zeros((len(PENALTIES), targets.shape[1]))
     gram, before = features.T @ features, np.sum(targets**2, axis=0)
@@ -327,7 +335,9 @@ def _variables(m: Measurement) -> tuple[tuple[str, ...], np.ndarray]:
             columns["forward speed"], columns["sideward speed"], columns["climb speed"] = body.T
             columns["speed"] = np.linalg.norm(flight.velocity[rows], axis=1)
     if flight.angular_velocity is not None:
-        columns |= dict(zip(("roll rate", "pitch rate", "yaw rate"), flight.angular_velocity[rows].T, strict=True))
+        columns |= dict(
+            zip(("roll rate", "pitch rate", "yaw rate"), flight.angular_velocity[rows].T, strict=True)
+        )
     if flight.battery_voltage is not None:
         columns["battery voltage"] = flight.battery_voltage[rows]
     return tuple(columns), np.column_stack(list(columns.values()))

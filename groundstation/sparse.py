@@ -1,9 +1,9 @@
 """A short formula for what no effect explains, and the effect file that it becomes.
 
 Orthogonal forward selection (Chen, Billings & Luo 1989) over a library of physical terms, each on each body axis. A
-term stays if it explains more than the best of all terms explains of made-up residuals, of both kinds that
-`groundstation.remainder` tells of, and if it makes held-out blocks better. STLSQ, PySINDy's default, keeps terms by the size of their coefficient,
-which says nothing under correlated residuals.
+term stays if it explains more than the best of all terms explains of made-up residuals (`groundstation.surrogates`),
+and if it makes held-out blocks better. (STLSQ, PySINDy's default, keeps terms by the size of their coefficient, which
+says nothing under correlated residuals.)
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MOST_TERMS = 4
 
 @dataclass(frozen=True)
 class Symbol:
-    """A letter of the formulas: `code` computes it from a `Motion`, in units of m^`length` s^`time`; it reads `needs`."""
+    """A letter of the formulas: `code` computes it from a `Motion`, in m^`length` s^`time`; it reads `needs`."""
 
     letter: str
     code: str
@@ -90,10 +90,15 @@ def _power(unit: str, exponent: int) -> str:
     return unit if exponent == 1 else f"{unit}^{exponent}"
 
 
+def written(term: str) -> str:
+    """The term as people write it: u u is u², 1/h 1/h is 1/h²."""
+    return re.sub(r"(\S+) \1(?= |$)", r"\1²", term)
+
+
 def code_of(term: str) -> str:
     """The term in Python, over its letters."""
-    written = {"|": "xp.abs({})", "1": "(1.0 / {})"}
-    factors = (written.get(f[0], "{}").format(_letters(f)[0]) for f in term.split())
+    shapes = {"|": "xp.abs({})", "1": "(1.0 / {})"}
+    factors = (shapes.get(f[0], "{}").format(_letters(f)[0]) for f in term.split())
     return " * ".join(factors)
 
 
@@ -102,7 +107,7 @@ def _columns(motion: Motion, known: set[str]) -> tuple[list[str], np.ndarray]:
     values: dict[str, np.ndarray] = {}
     for letter, symbol in SYMBOLS.items():
         if set(symbol.needs) <= known:
-            values[letter] = eval(symbol.code, {"xp": np, "motion": motion})  # noqa: S307 - our own table above
+            values[letter] = eval(symbol.code, {"xp": np, "motion": motion})
     names = [term for term in TERMS if set(_letters(term)) <= set(values)]
     return names, np.column_stack([eval(code_of(t), {"xp": np, **values}) for t in names])
 
@@ -149,7 +154,7 @@ def formula_text(terms: tuple[FormulaTerm, ...]) -> str:
     """The formula as people write it, one axis after the other."""
     axes = sorted({t.axis for t in terms})
     sides = (
-        f"a_{axis} = " + " + ".join(f"{t.coefficient:.3g} {t.term}" for t in terms if t.axis == axis)
+        f"a_{axis} = " + " + ".join(f"{t.coefficient:.3g} {written(t.term)}" for t in terms if t.axis == axis)
         for axis in axes
     )
     return "; ".join(sides).replace("+ -", "- ")
@@ -227,9 +232,7 @@ def _jackknife(
     return [found[key] for key in chosen]
 
 
-def write_effect(
-    formula: SparseFormula, name: str, folder: Path, flight: str, data_hash: str, share: float
-) -> Path:
+def write_effect(formula: SparseFormula, name: str, folder: Path, flight: str, data_hash: str) -> Path:
     """Write the formula as an effect of the user's own: `folder`/`name`.py.
 
     Raises `InputError` for a name that is none or taken, and where the file exists or cannot be written.
@@ -244,7 +247,7 @@ def write_effect(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as file:
-            file.write(effect_source(formula, name, flight, data_hash, share))
+            file.write(effect_source(formula, name, flight, data_hash))
     except FileExistsError:
         raise InputError(f"{path} exists already; choose another --name or folder") from None
     except OSError as error:
@@ -252,7 +255,7 @@ def write_effect(
     return path
 
 
-def effect_source(formula: SparseFormula, name: str, flight: str, data_hash: str, share: float) -> str:
+def effect_source(formula: SparseFormula, name: str, flight: str, data_hash: str) -> str:
     """The effect file of a formula."""
     letters = sorted({letter for t in formula.terms for letter in _letters(t.term)})
     symbols = [SYMBOLS[letter] for letter in letters]
@@ -262,11 +265,13 @@ def effect_source(formula: SparseFormula, name: str, flight: str, data_hash: str
         axes[t.axis].append(f"{parameter} * {code_of(t.term)}")
     said = "; ".join(
         f"a_{axis} = "
-        + " + ".join(f"{c} {t.term}" for c, t in zip(names, formula.terms, strict=True) if t.axis == axis)
+        + " + ".join(
+            f"{c} {written(t.term)}" for c, t in zip(names, formula.terms, strict=True) if t.axis == axis
+        )
         for axis in sorted({t.axis for t in formula.terms})
     )
     parameters = "\n".join(
-        f'        Parameter("{c}", "{t.unit}", "of {t.term} along body {t.axis}", 0.0, {t.coefficient:.4g}, '
+        f'        Parameter("{c}", "{t.unit}", "of {written(t.term)} along body {t.axis}", 0.0, {t.coefficient:.4g}, '
         f"{-10 * abs(t.coefficient):.4g}, {10 * abs(t.coefficient):.4g}),"
         for c, t in zip(names, formula.terms, strict=True)
     )
@@ -304,8 +309,8 @@ EFFECT = Effect(
     ),
     needs=({", ".join(f'"{n}"' for n in needs)}{"," if len(needs) == 1 else ""}),
     manoeuvre="the flight it was found in, and one that varies {", ".join(s.meaning for s in symbols)} on their own",
-    citation="fitted to {flight} (sha256 {data_hash[:16] or "unknown"}), {share:.0%} of the error that the catalogue left "
-    "there; a regularity of these data, not a law",
+    citation="fitted to {flight} (sha256 {data_hash[:16] or "unknown"}); a regularity of these data, not a law: it "
+    "takes {formula.variance_share:.0%} of the error that the catalogue left there",
     exports={all(s.static for s in symbols)},
 )
 '''

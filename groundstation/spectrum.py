@@ -106,7 +106,10 @@ def _cause(m: Measurement, frequency: float) -> str:
         flying = slice(None) if flight.flying is None else flight.flying
         turns = flight.rotor_speed[flying] / (2.0 * np.pi)
         turning, spread = float(np.nanmedian(turns)), float(np.nanstd(turns))
-        for multiple, what in ((1, "once a turn of the rotors: one is out of balance"), (2, "the blades pass")):
+        for multiple, what in (
+            (1, "once a turn of the rotors: one is out of balance"),
+            (2, "the blades pass"),
+        ):
             f = multiple * turning
             seen = abs(f - rate * round(f / rate))
             if turning > 1.0 and multiple * spread < NEIGHBOURHOOD and abs(seen - frequency) < 1.0:

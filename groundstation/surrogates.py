@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-BURST = 0.5
+BURST = 1.0
 """s of residual that keep their sign together when signs are drawn: slower wander is kept by the random phases."""
 
 
@@ -22,9 +22,7 @@ def random_phases(
     return np.fft.irfft(spectrum[:, None, :] * turn[:, :, None], n=len(residual), axis=0)
 
 
-def random_signs(
-    residual: np.ndarray, burst: np.ndarray, count: int, rng: np.random.Generator
-) -> np.ndarray:
+def random_signs(residual: np.ndarray, burst: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """(M, count, A): residuals (M, A) with the sign of each `burst` (M,) drawn anew, all axes alike.
 
     The wild cluster bootstrap of Cameron, Gelbach & Miller, Rev. Econ. Stat. 90, 2008.
