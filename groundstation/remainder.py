@@ -14,11 +14,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
 
 from groundstation.fitting import BLOCK
 from groundstation.measurement import Measurement
-from groundstation.results import SpectralLine, Unexplained
+from groundstation.results import SparseFormula, Unexplained
 from groundstation.sparse import sparse_formula
 from groundstation.spectrum import spectral_lines
 from groundstation.surrogates import BURST, random_phases, random_signs
@@ -28,6 +29,8 @@ SHARE = 0.05
 """Part of the remaining squared error that must be predictable on held-out blocks to be called structure."""
 MATERIAL = 0.03
 """m/s² RMS of that part."""
+CONSTANT = 0.1
+"""m/s² from which a constant is told: a MEMS accelerometer's zero comes back to 10 mg from one day to the next."""
 ALPHA = 0.01
 """Probability that a residual without structure is said to have some."""
 SURROGATES = 199
@@ -43,51 +46,87 @@ PLACE_FEATURES = 40
 
 
 def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
-    """Look for structure in `residual` (K, A), the used samples of `measurement`; the same every time."""
-    lines = spectral_lines(measurement, residual)
-    error = float(np.mean(np.sum(residual**2, axis=1)))
-    heard = tuple(line for line in lines if line.in_band and line.rms**2 > SHARE * error)
+    """Look for structure in `residual` (K, A), the used samples of `measurement`; the same every time.
+
+    A constant, lines of the spectrum, and what the flight's variables predict are looked for one beside the other.
+    """
     total = float(np.sum(residual**2))
-    study = _study(measurement, residual)
-    formula = sparse_formula(measurement, residual)
-    if formula is not None and not _material(formula.variance_share, residual):
+    constant = _constant(measurement, residual)
+    lines = spectral_lines(measurement, residual)
+    heard = [
+        line for line in lines if line.in_band and _material(len(residual) * line.rms**2 / total, residual)
+    ]
+    swinging = residual - residual.mean(axis=0)
+    study = _study(measurement, swinging)
+    learnt = max(0.0, study.explained / total)
+    formula = sparse_formula(measurement, swinging)
+    if formula is not None and not _material(formula.variance_share, swinging):
         formula = None
-    share, p = max(0.0, study.explained / total), 1.0
-    if _material(share, residual):
-        # a formula is tested against made-up residuals already
-        p = ALPHA if formula is not None else study.p_value()
-    elif formula is not None:
-        p = ALPHA
-    share = max(share, 0.0 if formula is None else formula.variance_share)
-    if p > ALPHA:
-        where = tuple(_said(line) for line in heard)
-        return Unexplained(
-            bool(heard), share, where, min([p, *(line.p_value for line in heard)]), lines=lines,
-            advice=_advice_on_lines(heard) if heard else "",
-        )  # fmt: skip
-    variables = study.importance()
-    goes_with = tuple(
-        f"{name} ({part:.0%} of the remaining error goes with it{study.at(name)})"
-        for name, part in list(variables.items())[:3]
-        if part > 0.01
-    )
-    told = (
-        ()
-        if formula is None
-        else (f"{formula.text} takes {formula.variance_share:.0%} of the remaining error",)
-    )
+    # a formula has been tested against made-up residuals already
+    p = ALPHA if formula is not None else study.p_value() if _material(learnt, residual) else 1.0
+    structure = p <= ALPHA
+    where = [] if structure else [c.text for c in constant]
+    variables: dict[str, float] = {}
+    if structure:
+        learnt = max(learnt, 0.0 if formula is None else formula.variance_share * np.sum(swinging**2) / total)
+        if formula is not None:
+            where.append(f"{formula.text} takes {formula.variance_share:.0%} of the remaining error")
+        variables = study.importance()
+        where += [
+            f"{name} ({part:.0%} of the remaining error goes with it{study.at(name)})"
+            for name, part in list(variables.items())[:3]
+            if part > 0.01
+        ]
+    where += [f"{h.frequency:.1f} Hz on body {h.axis} ({h.rms:.2f} m/s² RMS): {h.text}" for h in heard]
+    advice = ""
+    if structure:
+        advice = _advice(learnt, variables, formula)
+    elif constant:
+        advice = (
+            "a constant has many causes: fly what groundstation plan-flight FLIGHT designs, to tell which"
+        )
+    elif heard:
+        advice = (
+            f"no static effect swings at {heard[0].frequency:.1f} Hz: look at mounting, rotors and loop gains"
+        )
     return Unexplained(
-        True,
-        share,
-        (*told, *goes_with, *(_said(line) for line in heard)),
-        p,
-        variables,
-        study.axes(),
-        study.moments(),
-        lines,
-        formula,
-        _advice(share, variables, formula is not None and formula.variance_share > 0.5 * share),
+        verdict=bool(structure or constant or heard),
+        variance_share=float((learnt if structure else 0.0) + sum(c.share for c in constant)),
+        where=tuple(where),
+        p_value=float(min([p, *(c.p_value for c in constant), *(h.p_value for h in heard)])),
+        variables=variables,
+        axes=study.axes() if structure else {},
+        moments=study.moments() if structure else (),
+        lines=lines,
+        formula=formula,
+        advice=advice,
     )
+
+
+@dataclass(frozen=True)
+class _Constant:
+    text: str
+    share: float
+    p_value: float
+
+
+def _constant(m: Measurement, residual: np.ndarray) -> list[_Constant]:
+    """Axes on which the residual has a mean, by a t-test over blocks."""
+    block = ((m.t[m.used] - m.t[0]) / BLOCK).astype(int)
+    _, block = np.unique(block, return_inverse=True)
+    count = np.bincount(block)
+    if len(count) < 3:
+        return []
+    found = []
+    for column, axis in enumerate(m.axes):
+        means = np.bincount(block, weights=residual[:, column]) / count
+        mean = float(np.mean(residual[:, column]))
+        p = float(stats.ttest_1samp(means, 0.0).pvalue) * len(m.axes)
+        share = len(residual) * mean**2 / float(np.sum(residual**2))
+        if p < ALPHA and abs(mean) > CONSTANT and _material(share, residual):
+            text = f"a constant {mean:.2f} m/s² on body {'xyz'[axis]} ({share:.0%} of the remaining error)"
+            found.append(_Constant(text, share, p))
+    return found
 
 
 def _material(share: float, residual: np.ndarray) -> bool:
@@ -95,21 +134,13 @@ def _material(share: float, residual: np.ndarray) -> bool:
     return share > SHARE and bool(np.sqrt(share * np.sum(residual**2) / len(residual)) > MATERIAL)
 
 
-def _said(line: SpectralLine) -> str:
-    return f"{line.frequency:.1f} Hz on body {line.axis} ({line.rms:.2f} m/s² RMS): {line.text}"
-
-
-def _advice_on_lines(lines: tuple[SpectralLine, ...]) -> str:
-    return f"no effect of a static model swings at {lines[0].frequency:.1f} Hz: look at mounting, rotors and loop gains"
-
-
-def _advice(share: float, variables: dict[str, float], formula: bool) -> str:
+def _advice(share: float, variables: dict[str, float], formula: SparseFormula | None) -> str:
     """What to do about structure that no effect explains."""
     if next(iter(variables), "") in ("east", "north"):
         return (
             "it goes with the place and not with the vehicle: look what is there (a fan, a wall, a draught)"
         )
-    if formula:
+    if formula is not None and formula.variance_share > 0.5 * share:
         return (
             "write the formula as an effect of your own: groundstation remainder FLIGHT --write DIR; or let a network "
             "learn it: groundstation train FLIGHT"

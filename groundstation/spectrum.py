@@ -119,11 +119,11 @@ def _cause(m: Measurement, frequency: float) -> str:
         rates = flight.angular_velocity.copy()
         if flight.flying is not None:
             rates[~flight.flying] = np.nan
-        f, spectra, count = _spectra(rates, flight.dt)
+        grid, spectra, count = _spectra(rates, flight.dt)
         if count:
             power = spectra.mean(axis=0)
-            here = int(np.argmin(np.abs(f - frequency)))
-            near = (np.abs(f - frequency) < 0.5 * NEIGHBOURHOOD) & (f > LOWEST)
+            here = int(np.argmin(np.abs(grid - frequency)))
+            near = (np.abs(grid - frequency) < 0.5 * NEIGHBOURHOOD) & (grid > LOWEST)
             if np.any(power[max(here - 1, 0) : here + 2] > 5.0 * np.median(power[near], axis=0)):
                 return "the body rates swing with it: a control loop oscillates, or a mode of the frame"
     if frequency > m.bandwidth:

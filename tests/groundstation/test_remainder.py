@@ -94,10 +94,17 @@ def test_a_force_of_no_catalogue_entry_becomes_an_effect_that_explains_it(tmp_pa
         write_effect(left.formula, "side_force", tmp_path, hidden.name, "")
 
 
+def test_a_constant_force_is_told() -> None:
+    flight = simulated(201)
+    left = remainder(with_force(flight, 0, np.full(len(flight), 0.9)))
+    assert left.verdict
+    assert left.where == ("a constant 0.90 m/s² on body x (98% of the remaining error)",)
+
+
 def test_a_draught_at_a_place_is_told_as_one() -> None:
     flight = simulated(201)
     x, y, _ = flight.position.T
-    left = remainder(with_force(flight, 2, np.exp(-((x - 1.0) ** 2 + y**2) / (2 * 0.5**2))))
+    left = remainder(with_force(flight, 2, np.exp(-((x - 1.0) ** 2 + y**2) / (2 * 0.8**2))))
     assert left.verdict
     assert left.formula is None
     assert next(iter(left.variables)) in ("east", "north")
