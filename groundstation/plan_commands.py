@@ -41,15 +41,19 @@ def register(app: typer.Typer) -> None:
 
 def plan_command(
     flight: Annotated[
-        Path | None, typer.Argument(help="A flight whose diagnosis left something open; its noise is taken, too.")
+        Path | None,
+        typer.Argument(help="A flight whose diagnosis left something open; its noise is taken, too."),
     ] = None,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The setpoints to write.")] = Path("plan.csv"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="The setpoints to write.")] = Path(
+        "plan.csv"
+    ),
     between: Annotated[
         list[str] | None, typer.Option("--between", help="An effect to tell from the others. Repeatable.")
     ] = None,
     vehicle: VehicleOption = None,
     design: Annotated[
-        Path | None, typer.Option(help="Design file; default: the record's, or design.json beside the vehicle.")
+        Path | None,
+        typer.Option(help="Design file; default: the record's, or design.json beside the vehicle."),
     ] = None,
     mapping: MappingOption = None,
     model: ModelOption = None,
@@ -117,13 +121,15 @@ def plan_command(
 
 def _design(given: Path | None, vehicle: Vehicle, flight: Path | None) -> Design:
     """The design that will fly: the one given, the record's own, or the one beside the vehicle file."""
-    from models.design import design_from_json, load_design
+    from models.design import load_design
     from models.record import read_record
 
     if given is not None:
         return load_design(given, vehicle)
     if flight is not None and flight.suffix.lower() == ".mcap":
-        return design_from_json(read_record(flight).design, str(flight))
+        recorded = read_record(flight).design
+        if recorded is not None:
+            return recorded
     beside = Path(vehicle.source).with_name("design.json") if vehicle.source else Path("design.json")
     if not beside.is_file():
         raise InputError(f"{beside}: no design to predict the flight by; pass --design FILE")
@@ -142,7 +148,9 @@ def _print(plan: FlightPlan, output: Path) -> None:
     )
     for text in plan.manoeuvres:
         console.print(f"  {text}", highlight=False)
-    table = Table(title="what it will tell (evidence above 6 tells two explanations apart)", title_justify="left")
+    table = Table(
+        title="what it will tell (evidence above 6 tells two explanations apart)", title_justify="left"
+    )
     for column in ("if it is", "and not", "evidence so far", "expected", ""):
         table.add_column(column, justify="right" if column[:1] == "e" else "left")
     for q in plan.questions:

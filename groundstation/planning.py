@@ -164,7 +164,9 @@ def plan_flight(
         flown,
         tuple(manoeuvres[i].text for i in chosen),
         study.answers(before, after),
-        study.precision(before, after, None if diagnosis is None else diagnosis.flight.duration, flown.duration),
+        study.precision(
+            before, after, None if diagnosis is None else diagnosis.flight.duration, flown.duration
+        ),
         study.left_out,
     )
 
@@ -281,10 +283,16 @@ def _attitude(up: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     x /= np.linalg.norm(x, axis=1)[:, None]
     y = np.cross(up, x)
     w = 0.5 * np.sqrt(np.maximum(1.0 + x[:, 0] + y[:, 1] + up[:, 2], 1e-9))
-    first = np.column_stack([4 * w * w, y[:, 2] - up[:, 1], up[:, 0] - x[:, 2], x[:, 1] - y[:, 0]]) / (4 * w)[:, None]
+    first = (
+        np.column_stack([4 * w * w, y[:, 2] - up[:, 1], up[:, 0] - x[:, 2], x[:, 1] - y[:, 0]])
+        / (4 * w)[:, None]
+    )
     # half a turn from the world the formula above divides by zero; about z there is another
     z = 0.5 * np.sqrt(np.maximum(1.0 - x[:, 0] - y[:, 1] + up[:, 2], 1e-9))
-    second = np.column_stack([x[:, 1] - y[:, 0], up[:, 0] + x[:, 2], y[:, 2] + up[:, 1], 4 * z * z]) / (4 * z)[:, None]
+    second = (
+        np.column_stack([x[:, 1] - y[:, 0], up[:, 0] + x[:, 2], y[:, 2] + up[:, 1], 4 * z * z])
+        / (4 * z)[:, None]
+    )
     quaternion = np.where((w > z)[:, None], first, second)
     flips = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0.0, -1.0, 1.0))
     quaternion[1:] *= flips[:, None]
@@ -478,7 +486,11 @@ class _Study:
                     name, step = free.parameter.name, 0.01 * free.spread
                     if values[name] + step > free.high:
                         step = -step
-                    moved = [*chain[:index], (effect, {**values, name: values[name] + step}), *chain[index + 1 :]]
+                    moved = [
+                        *chain[:index],
+                        (effect, {**values, name: values[name] + step}),
+                        *chain[index + 1 :],
+                    ]
                     columns[:, next(place)] = ((problem.predict(moved) - here) / step).ravel()
 
         with_parameters = [link for link in settled if link[0].parameters]
@@ -487,7 +499,9 @@ class _Study:
         if all(effect.name != "transport_delay" for effect, _ in settled):
             delay = effect_named("transport_delay")
             believed = {"delay": self.vehicle.command_delay + 0.5 * period}
-            columns[:, self.clock] = ((problem.predict([*settled, (delay, believed)]) - base) / (0.5 * period)).ravel()
+            columns[:, self.clock] = (
+                (problem.predict([*settled, (delay, believed)]) - base) / (0.5 * period)
+            ).ravel()
         for c, own, size in zip(self.candidates, self.own, self.size, strict=True):
             added = [(self.known[n], dict(v)) for n, v in zip(c.names, c.values, strict=True)]
             columns[:, size] = (problem.predict([*settled, *added]) - base).ravel()
@@ -525,7 +539,10 @@ class _Study:
         found: list[float] = []
         for c, own in zip(self.candidates, self.own, strict=True):
             sizes = [
-                max(abs(values[p.name] - p.neutral_for(self.vehicle)), abs(p.typical - p.neutral_for(self.vehicle)))
+                max(
+                    abs(values[p.name] - p.neutral_for(self.vehicle)),
+                    abs(p.typical - p.neutral_for(self.vehicle)),
+                )
                 for name, values in zip(c.names, c.values, strict=True)
                 for p in self.known[name].parameters
             ]
@@ -566,7 +583,9 @@ class _Study:
                     halves.append([None] * len(own))
                     continue
                 halves.append((critical_value(duration) * self._deviations(information, own)).tolist())
-            values = [v[p.name] for v, n in zip(c.values, c.names, strict=True) for p in self.known[n].parameters]
+            values = [
+                v[p.name] for v, n in zip(c.values, c.names, strict=True) for p in self.known[n].parameters
+            ]
             for (name, p), value, was, will in zip(labels, values, *halves, strict=True):
                 found.append(Precision(name, p.name, p.unit, value, was, will))
         return tuple(found)
@@ -625,4 +644,3 @@ def setpoints(flown: Trajectory) -> str:
     rows = np.column_stack([c.t, c.position, c.velocity, c.acceleration, c.yaw])
     writer.writerows([f"{value:.6f}" for value in row] for row in rows)
     return out.getvalue()
-
