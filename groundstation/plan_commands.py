@@ -25,7 +25,6 @@ from models.errors import InputError
 if TYPE_CHECKING:
     from groundstation.planning import FlightPlan
     from models.design import Design
-    from models.flight import Flight
     from models.vehicle import Vehicle
 
 console = Console()
@@ -35,7 +34,7 @@ def register(app: typer.Typer) -> None:
     """Add this command to the ground station's application."""
     app.command(
         "plan-flight",
-        epilog="Example: groundstation plan-flight flight.mcap --between rotor_drag --between parasitic_drag -o plan.csv",
+        epilog="Example: groundstation plan-flight flight.mcap --between wind --between rotor_drag -o plan.csv",
     )(plan_command)
 
 
