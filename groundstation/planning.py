@@ -22,6 +22,7 @@ import numpy as np
 from groundstation.diagnosis import STRONG_EVIDENCE
 from groundstation.expected import Reference, expected_behaviour
 from groundstation.fitting import (
+    BLOCK,
     HAC_LAG,
     UNMODELLED,
     Problem,
@@ -51,6 +52,8 @@ ENOUGH = 45.0
 spreads by twice its root."""
 PRECISE = 0.2
 """Half width of a 95 % interval over the size of the parameter, at which it counts as known."""
+LEAST = 3.5 * BLOCK
+"""s of flight, so that every manoeuvre is seen again on a part that was held out."""
 SAMPLING = 0.1
 """s between two setpoints of the file."""
 
@@ -630,6 +633,13 @@ def _choose(
         chosen.append(best)
         total = total + known[best]
         left -= manoeuvres[best].trajectory.duration
+    once = list(chosen)
+    while once and limits.duration - left < LEAST:
+        again = once[(len(chosen) - len(once)) % len(once)]
+        if manoeuvres[again].trajectory.duration > left:
+            break
+        chosen.append(again)
+        left -= manoeuvres[again].trajectory.duration
     return chosen
 
 
