@@ -17,6 +17,7 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
 
+from groundstation.bins import bins
 from groundstation.fitting import BLOCK
 from groundstation.measurement import Measurement
 from groundstation.results import SparseFormula, Unexplained
@@ -65,7 +66,9 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
     # a formula has been tested against made-up residuals already
     p = ALPHA if formula is not None else study.p_value() if _material(learnt, residual) else 1.0
     structure = p <= ALPHA
-    where = [] if structure else [c.text for c in constant]
+    # what varies has a mean as well: a constant is only told where it is more than that
+    steady = sum(c.share for c in constant)
+    where = [c.text for c in constant] if not structure or steady > learnt else []
     variables: dict[str, float] = {}
     if structure:
         learnt = max(learnt, 0.0 if formula is None else formula.variance_share * np.sum(swinging**2) / total)
@@ -247,13 +250,7 @@ def _study(m: Measurement, residual: np.ndarray) -> _Study:
     t = m.t[m.used]
     period = float(np.median(np.diff(m.t)))
     width = max(BIN, period, len(t) * period / MOST_BINS)
-    number = ((t - t[0]) / width).astype(int)
-    _, start, index = np.unique(number, return_index=True, return_inverse=True)
-    size = np.bincount(index)
-
-    def binned(columns: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(columns, start, axis=0) / size[:, None]
-
+    begin, binned = bins(t, width)
     names, values = _variables(m)
     variables = binned(values)
     scale = variables.std(axis=0)
@@ -261,7 +258,7 @@ def _study(m: Measurement, residual: np.ndarray) -> _Study:
     names = tuple(n for n, k in zip(names, keep, strict=True) if k)
     variables = variables[:, keep]
     averaged = binned(residual)
-    _, block = np.unique(((t[start] - t[0]) / BLOCK).astype(int), return_inverse=True)
+    _, block = np.unique(((begin - t[0]) / BLOCK).astype(int), return_inverse=True)
     fold = block * min(FOLDS, int(block.max()) + 1) // (int(block.max()) + 1)
     features = _features(names, variables, variables)
     gains = _gains(features, averaged, fold).sum(axis=1)
@@ -271,7 +268,7 @@ def _study(m: Measurement, residual: np.ndarray) -> _Study:
         prediction[rows] = features[rows] @ weights
     count = len(t) / len(averaged)
     return _Study(
-        t=t[start],
+        t=begin,
         residual=averaged,
         count=count,
         block=block,

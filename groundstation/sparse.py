@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from groundstation.bins import bins
 from groundstation.fitting import BLOCK
 from groundstation.measurement import Measurement
 from groundstation.results import FormulaTerm, SparseFormula
@@ -29,6 +30,8 @@ SURROGATES = 199
 HELD_OUT_GAIN = 0.01
 """Smallest part of the remaining squared error that a term must take away on held-out blocks."""
 MOST_TERMS = 4
+MOST_ROWS = 6000
+"""Rows that are looked at; those of longer flights are averages."""
 
 
 @dataclass(frozen=True)
@@ -120,11 +123,14 @@ def sparse_formula(measurement: Measurement, residual: np.ndarray) -> SparseForm
         return None
     known = {n for n in ("quaternion", "velocity", "position", "angular_velocity") if m.flight.has(n)}
     names, columns = _columns(motion, known)
-    library = m.smooth(columns)[m.used]
-    block = ((m.t[m.used] - m.t[0]) / BLOCK).astype(int)
-    _, block = np.unique(block, return_inverse=True)
+    library, t = m.smooth(columns)[m.used], m.t[m.used]
+    whole = float(np.mean(residual**2))
+    if len(t) > MOST_ROWS:
+        t, average = bins(t, len(t) / MOST_ROWS * float(np.median(np.diff(m.t))))
+        library, residual = average(library), average(residual)
+    _, block = np.unique(((t - t[0]) / BLOCK).astype(int), return_inverse=True)
     total = float(np.sum(residual**2))
-    burst = ((m.t[m.used] - m.t[0]) / BURST).astype(int)
+    burst = ((t - t[0]) / BURST).astype(int)
     # every axis has its mean in the fit: a constant is no structure
     chosen: list[tuple[int, int]] = []  # (axis column, term)
     error = total
@@ -147,7 +153,7 @@ def sparse_formula(measurement: Measurement, residual: np.ndarray) -> SparseForm
         )
         for (a, k), (c, s) in zip(chosen, estimates, strict=True)
     )  # fmt: skip
-    return SparseFormula(formula_text(terms), terms, max(0.0, 1.0 - error / total))
+    return SparseFormula(formula_text(terms), terms, max(0.0, total - error) / (whole * residual.size))
 
 
 def formula_text(terms: tuple[FormulaTerm, ...]) -> str:
