@@ -73,7 +73,7 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
     if structure:
         learnt = max(learnt, 0.0 if formula is None else formula.variance_share * np.sum(swinging**2) / total)
         if formula is not None:
-            where.append(f"{formula.text} takes {formula.variance_share:.0%} of the remaining error")
+            where.append(f"{formula.text} takes {formula.variance_share:.0%} of what varies")
         variables = study.importance()
         where += [
             f"{name} ({part:.0%} of the remaining error goes with it{study.at(name)})"

@@ -149,8 +149,8 @@ class FormulaTerm:
 
 @dataclass(frozen=True)
 class SparseFormula:
-    """A short formula for what no effect explains. `variance_share` is the part of the remaining squared error that it
-    takes away on held-out blocks."""
+    """A short formula for what no effect explains. `variance_share` is the part of what varies in the
+    residual (squared, about its mean) that it takes away on held-out blocks."""
 
     text: str
     terms: tuple[FormulaTerm, ...]

@@ -316,7 +316,7 @@ EFFECT = Effect(
     needs=({", ".join(f'"{n}"' for n in needs)}{"," if len(needs) == 1 else ""}),
     manoeuvre="the flight it was found in, and one that varies {", ".join(s.meaning for s in symbols)} on their own",
     citation="fitted to {flight} (sha256 {data_hash[:16] or "unknown"}); a regularity of these data, not a law: it "
-    "takes {formula.variance_share:.0%} of the error that the catalogue left there",
+    "takes {formula.variance_share:.0%} of what varies in the error that the catalogue left there",
     exports={all(s.static for s in symbols)},
 )
 '''
