@@ -197,6 +197,12 @@ def diagnose_command(
     everything: Annotated[
         bool, typer.Option("--all", help="Parameters of every effect, found or not.")
     ] = False,
+    thrust: Annotated[
+        str,
+        typer.Option(
+            "--thrust", help="command, or rotors: thrust by rotor speeds, what is beyond them is judged."
+        ),
+    ] = "command",
     as_json: JsonOption = False,
 ) -> None:
     """Which effect is missing: ranked, with parameters and intervals, checked on held-out data.
@@ -209,6 +215,13 @@ def diagnose_command(
 
     read = _read(flight, vehicle, mapping)
     held_out = None if validate is None else _read(validate, vehicle or _same(read), mapping)
+    if thrust not in ("command", "rotors"):
+        raise InputError(f"--thrust {thrust}: choose command or rotors")
+    if thrust == "rotors":
+        from groundstation.rotors import thrust_from_rotors
+
+        read = thrust_from_rotors(read)
+        held_out = None if held_out is None else thrust_from_rotors(held_out)
     base = chosen_model(model, read, store, effects)
     if "rigid_body" not in base.names():
         from models.model import rigid_body_model

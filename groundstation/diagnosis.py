@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from scipy import stats
@@ -31,6 +30,7 @@ from groundstation.measurement import Measurement, measure
 from groundstation.remainder import unexplained
 from groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
 from groundstation.rotation import RotationalFindings, judge_rates, judge_rotation
+from groundstation.rotors import BESIDE, PATH, RotorProblem, has_rotor_speeds
 from models.effect import Effect, Parameter, Stage
 from models.effects import catalogue, effect_named
 from models.errors import InputError
@@ -88,14 +88,35 @@ def diagnose(
     progress("looking at the rotation")
     rotation = judge_rotation(flight, base.names(), base.effects_directory)
     everything = _Search(whole, base, held_out, rotation, progress)
-    if flight.duration <= LONG:
-        return everything.report(everything.select(), everything)
-    parts = replace(whole, measurements=_spread(flight, bandwidth) or whole.measurements)
-    search = _Search(parts, base, held_out, rotation, progress)
+    search = everything
+    if flight.duration > LONG:
+        parts = replace(whole, measurements=_spread(flight, bandwidth) or whole.measurements)
+        search = _Search(parts, base, held_out, rotation, progress)
+    if has_rotor_speeds(flight):
+        progress("looking between command and rotors")
+        search.on_the_way = _on_the_way(search, base, rotation)
     found = search.select()
+    if search is everything:
+        return search.report(found, everything)
     progress("fitting what was found to the whole flight")
     kept = everything.settle(found.added)
     return search.report(search.state(kept.added), everything)
+
+
+def _on_the_way(search: _Search, base: Model, rotation: RotationalFindings) -> tuple[Term, ...]:
+    """The effects that rotor speeds show between command and rotor.
+
+    None where they leave more of the rotors' thrust unexplained than the accelerometer's noise: there the rotors did
+    not follow the collective (a saturated mixer), and prove nothing.
+    """
+    problem = RotorProblem(search.problem.measurements, base.effects_directory)
+    path = _Search(problem, base, None, replace(rotation, terms=()), lambda _: None)
+    path.candidates = [n for n in PATH if n in path.candidates]
+    path.beside = tuple(n for n in BESIDE if n not in base.names())
+    found = path.select()
+    left = np.sqrt(found.fit.sse / path.samples)
+    floor = min(float(m.noise[2]) for m in problem.measurements)
+    return tuple(t for t in found.fit.terms if t.effect in found.added) if left < floor else ()
 
 
 def _spread(flight: Flight, bandwidth: float | None) -> tuple[Measurement, ...]:
@@ -131,7 +152,12 @@ class _Search:
         self.candidates = [n for n in self.known if n not in base.names() and self._measurable(self.known[n])]
         self.samples = problem.measured().size
         self.significance = FAMILY / max(1, len(self.candidates))
+        self.on_the_way: tuple[Term, ...] = ()
+        """Effects that rotor speeds have shown to act before the rotors."""
+        self.beside: tuple[str, ...] = ()
+        """Effects fitted in every state without being judged."""
         self._states: dict[frozenset[str], _State] = {}
+        self._errors_before: dict[bool, float] = {}
 
     @property
     def flight(self) -> Flight:
@@ -151,8 +177,9 @@ class _Search:
             near = max((k for k in self._states if k <= key), key=len, default=frozenset())
             start = {t.effect: t.values for t in self._states[near].fit.terms} if near else {}
             # what the rotation has found acts on the thrust, too, and is not fitted to it once more
-            terms = [*self.base.terms, *self.rotation.terms, *(Term(n, start.get(n, {})) for n in added)]
-            fitted = fit(self.problem, terms, refit=list(added))
+            free = (*self.beside, *added)
+            terms = [*self.base.terms, *self.rotation.terms, *(Term(n, start.get(n, {})) for n in free)]
+            fitted = fit(self.problem, terms, refit=free)
             self._states[key] = _State(tuple(added), fitted, block_errors(fitted, self.blocks))
         return self._states[key]
 
@@ -164,7 +191,7 @@ class _Search:
 
     def select(self) -> _State:
         """The effects that are missing."""
-        current = self.state(())
+        current = self._backward(self.state([t.effect for t in self.on_the_way]))
         visited = {frozenset(current.added)}
         while len(current.added) < MOST_EFFECTS:
             self.progress(f"{len(current.added)} effects found, looking for the next")
@@ -368,7 +395,9 @@ class _Search:
         """Effects that could stand in for `name` at no cost."""
         rest = [n for n in current.added if n != name]
         present = {*self.base.names(), *rest}
-        found = []
+        found: list[str] = []
+        if name in {t.effect for t in self.on_the_way}:
+            return ()  # the rotors themselves show it
         for rival in self.candidates:
             needed = self.known[rival].with_any
             if rival in current.added or (needed and not present & set(needed)):
@@ -438,6 +467,9 @@ class _Search:
             whole.flight, self.base.names(), self.base.effects_directory, self._later(here)
         )
         rank = len(found)
+        unseen = tuple(v.name for v in rest if v.verdict == "not_excited" and self._in_command(v.name))
+        if unseen:
+            rates = [_possible(v, unseen) if v.verdict == "missing" else v for v in rates]
         for verdict in (*self.rotation.verdicts, *rates):
             rank += verdict.rank is not None
             verdicts.append(replace(verdict, rank=None if verdict.rank is None else rank))
@@ -468,14 +500,20 @@ class _Search:
             rotational=self.rotation.rms,
         )
 
+    def _in_command(self, name: str) -> bool:
+        return self.known[name].stage is Stage.COMMAND
+
     def _later(self, current: _State) -> float:
         """s by which rotors were found to follow their command later than believed: the rate loop is built on them."""
-        vehicle, later = self.problem.vehicle, 0.0
-        for term in current.fit.terms:
-            if term.effect in current.added and self.known[term.effect].stage is Stage.COMMAND:
-                for p in self.known[term.effect].parameters:
-                    later += max(0.0, float(term.values[p.name]) - p.neutral_for(vehicle))
-        return later
+        vehicle = self.problem.vehicle
+        found = {t.effect: t for t in current.fit.terms if t.effect in current.added}
+        found |= {t.effect: t for t in self.on_the_way}
+        return sum(
+            max(0.0, float(term.values[p.name]) - p.neutral_for(vehicle))
+            for name, term in found.items()
+            for p in self.known[name].parameters
+            if self._in_command(name)
+        )
 
     def _seen_as(self, name: str, fitted: Fit) -> tuple[str, ...]:
         """Rotational effects that may be what `name` shows, where the flight lacks the columns to tell."""
@@ -488,9 +526,14 @@ class _Search:
             and all(fitted.estimate[i] < 1.0 for i in fitted.of(name))
         )
 
-    @cache  # noqa: B019 - a search lives as long as its diagnosis
     def _before(self, held_out: bool = False) -> float:
         """Mean squared error of the base model as it stands, nothing refitted but the clock."""
+        # not functools.cache: it would keep every search of a long survey alive
+        if held_out not in self._errors_before:
+            self._errors_before[held_out] = self._error_before(held_out)
+        return self._errors_before[held_out]
+
+    def _error_before(self, held_out: bool) -> float:
         problem = self.held_out if held_out and self.held_out is not None else self.problem
         chain = with_clock(problem.measurements[0], self.base.chain())
         alone = [(effect, values) for effect, values in chain if effect.stage is not Stage.REMAINDER]
@@ -573,6 +616,12 @@ class _Search:
             f"needs {', '.join(missing) or 'measurements'}{through}; record it, and fly {effect.manoeuvre}"
         )
         return EffectVerdict(effect.name, "not_excited", None, 0.0, 1.0, (), (), advice)
+
+
+def _possible(verdict: EffectVerdict, rivals: tuple[str, ...]) -> EffectVerdict:
+    """The verdict where effects that this flight could not show would look the same."""
+    advice = f"{verdict.advice}; to tell it from {', '.join(rivals)}, fly quick vertical steps as well"
+    return replace(verdict, verdict="possible", indistinguishable_from=rivals, advice=advice)
 
 
 def _sizes(effect: Effect) -> list[Parameter]:

@@ -67,7 +67,7 @@ def sequential(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Sequ
     return torch.nn.Sequential(*modules)
 
 
-LOOKED_OVER = ("transport_delay", "motor_lag")
+LOOKED_OVER = ("transport_delay", "motor_lag", "rate_loop_lag")
 """Effects that the corrected controller undoes by looking ahead, not by the correction."""
 
 

@@ -40,8 +40,8 @@ class Vehicle:
     command that holds a hover at `nominal_voltage`; `command_delay` and `motor_time_constant` in s are what is
     known about the path from command to thrust, `rate_time_constant` in s about the closed loop of the body rates
     (0: nothing). `rotor_height` in m is that of the rotors above the ground where the recorded z is 0: a companion's z
-    is 0 where the vehicle stands. `thrust_model` is the assumed map from normalised command u to thrust in N: "linear"
-    `m g u / hover_thrust`, "quadratic" `m g (u / hover_thrust)²`.
+    is 0 where the vehicle stands. `thrust_model` is the assumed map from normalised command u to thrust in N:
+    "linear" `m g u / hover_thrust`, "quadratic" `m g (u / hover_thrust)²`.
     """
 
     name: str
@@ -55,8 +55,8 @@ class Vehicle:
     nominal_voltage: float = 16.0
     command_delay: float = 0.0
     motor_time_constant: float = 0.0
-    rotor_height: float = 0.0
     rate_time_constant: float = 0.0
+    rotor_height: float = 0.0
     source: str = field(default="", compare=False)
 
     @property

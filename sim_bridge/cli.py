@@ -35,12 +35,12 @@ VehicleFile = Annotated[
 ]
 Config = Annotated[Path | None, typer.Option(help="Configuration (sim-bridge.toml); flags override it.")]
 HiddenNames = Annotated[
-    list[str] | None, typer.Option(help="Effect to hide: NAME, NAME:SIZE, rich, random, none. Repeatable.")
+    list[str] | None, typer.Option(help="Effect to hide: NAME, NAME:SIZE, rich, random, any, none. Repeatable.")
 ]
-HiddenCount = Annotated[int | None, typer.Option(help="How many effects `random` draws.")]
+HiddenCount = Annotated[int | None, typer.Option(help="How many effects `random` or `any` draws.")]
 Seed = Annotated[int | None, typer.Option(help="Of the draw and of the noise.")]
 Sealed = Annotated[
-    Path | None, typer.Option(help="Where the answer to `random` or `rich` goes, for `reveal`.")
+    Path | None, typer.Option(help="Where the answer to `random`, `any` or `rich` goes, for `reveal`.")
 ]
 NoiseScale = Annotated[
     float | None, typer.Option(help="Scale of sensor noise and estimator errors; 0: none.")
@@ -62,7 +62,7 @@ def _seal(settings: Settings, hidden: tuple[Hidden, ...], vehicle: Vehicle, defa
     """
     from sim_bridge.seal import seal
 
-    if not settings.sealed and not {"random", "rich"} & set(settings.hidden):
+    if not settings.sealed and not {"random", "any", "rich"} & set(settings.hidden):
         return None
     path = Path(settings.sealed) if settings.sealed else default
     seal(hidden, vehicle.name, settings.seed, path)
@@ -489,7 +489,7 @@ def pilot(
 @app.command(epilog="Example: sim-bridge effects --json")
 def effects(as_json: Json = False) -> None:
     """List what can be hidden, with the range of its size when it is drawn, by name or `random`, and by `rich`."""
-    from sim_bridge.truth.hidden import EFFECTS, RICH
+    from sim_bridge.truth.hidden import EFFECTS, RICH, pool
 
     rows: list[dict[str, Any]] = [
         {
@@ -499,6 +499,7 @@ def effects(as_json: Json = False) -> None:
             "high": effect.high,
             "unit": next(iter(effect.units.values())),
             "random": effect.drawn,
+            "any": effect.name in pool("any"),
             "rich": RICH.get(effect.name),
         }
         for effect in EFFECTS.values()

@@ -20,9 +20,10 @@ def formula(motion: Motion, *, rho: Array, ceiling: Array) -> Motion:
     xp = array_namespace(motion.thrust)
     arms = motion.vehicle.rotor_positions or ((0.0, 0.0, 0.0),)
     up = motion.rotation[:, 2, :]  # world z in body axes
+    above = motion.height + motion.vehicle.rotor_height
     total = 0.0 * motion.thrust
     for x, y, z in arms:
-        distance = ceiling - (motion.height + up[:, 0] * x + up[:, 1] * y + up[:, 2] * z)
+        distance = ceiling - (above + up[:, 0] * x + up[:, 1] * y + up[:, 2] * z)
         ratio = rho * motion.vehicle.rotor_radius / (4.0 * xp.clip(distance, 1e-3, None))
         below = xp.clip(distance * 1e6, 0.0, 1.0)
         total = total + 1.0 / (1.0 - below * xp.clip(ratio * ratio, 0.0, STRONGEST))
@@ -33,7 +34,8 @@ def just_above(motion: Motion) -> Mapping[str, float]:
     """A ceiling one rotor radius above the highest point that the rotors reached for a moment."""
     reached = float(np.quantile(np.asarray(motion.height), 0.998))
     hubs = max((z for _, _, z in motion.vehicle.rotor_positions), default=0.0)
-    return {"ceiling": float(np.clip(reached + hubs + motion.vehicle.rotor_radius, LOWEST, HIGHEST))}
+    above = reached + hubs + motion.vehicle.rotor_height
+    return {"ceiling": float(np.clip(above + motion.vehicle.rotor_radius, LOWEST, HIGHEST))}
 
 
 LOWEST, HIGHEST = 0.3, 30.0

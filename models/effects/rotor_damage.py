@@ -39,7 +39,6 @@ EFFECT = Effect(
     "multiplicative loss of effectiveness as in Freddi, Lanzon, Longhi 2011 (IFAC World Congress)",
     confounded_with=("com_offset", "thrust_gain"),
     needs_any=("rotor_speed", "motor_command"),
-    exports=False,
     rotational=True,
     seen_as=("thrust_gain",),
     one_of=True,

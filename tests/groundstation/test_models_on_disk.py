@@ -13,6 +13,7 @@ from groundstation.compare import waterfall
 from groundstation.reading import read_flight
 from groundstation.store import add_effect, find, lineage, save
 from models import contract
+from models.effect import Stage
 from models.effects import catalogue
 from models.errors import InputError
 from models.export import export_onnx, not_exported
@@ -74,14 +75,16 @@ def test_onnx_file_predicts_as_the_model_and_carries_its_contract(flight) -> Non
     }
     model = rigid_body_model(flight.vehicle)
     model = model.with_terms(tuple(Term(name, values) for name, values in middle.items()))
-    assert set(not_exported(model)) == {"accelerometer_bias"}  # lag and delay are looked over
+    assert set(not_exported(model)) == {
+        *("accelerometer_bias", "imu_lever_arm", "com_offset", "gyroscopic")
+    }  # lag and delay are looked over
     session = onnxruntime.InferenceSession(export_onnx(model, flight))
     names = feature_names(model.names())
     assert names[-2:] == ("cos_psi", "sin_psi")
     columns = features_of_flight(flight)
     features = feature_matrix(columns, names)
     (delta,) = session.run([contract.OUTPUT_NAME], {contract.INPUT_NAME: features})
-    static = [(e, v) for e, v in model.chain() if e.exports and e.name != "accelerometer_bias"]
+    static = [(e, v) for e, v in model.chain() if e.exports and e.stage is not Stage.SENSOR]
     expected = error_acceleration(motion_of_features(columns, flight.vehicle), static)
     np.testing.assert_allclose(delta, expected, atol=2e-4)
     metadata = session.get_modelmeta().custom_metadata_map

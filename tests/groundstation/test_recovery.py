@@ -17,8 +17,10 @@ from groundstation.fitting import Problem, fit
 from groundstation.measurement import measure
 from groundstation.reading import read_flight
 from groundstation.results import Diagnosis, EffectVerdict
+from groundstation.rotors import thrust_from_rotors
 from models.design import load_design
 from models.effects import catalogue, effect_named
+from models.errors import InputError
 from models.flight import Flight
 from models.frames import quaternion_from_euler
 from models.model import Term, rigid_body_model
@@ -236,3 +238,31 @@ def test_made_effect_is_found_and_its_interval_holds_the_truth(name: str) -> Non
     for i in fitted.of(name):
         low, high = fitted.interval(i)
         assert low <= values[fitted.free[i].parameter.name] <= high
+
+
+def test_slow_rotors_are_not_taken_for_a_slow_rate_loop(folder) -> None:
+    # so much noise that the thrust's lag cannot be seen in the acceleration, while the rates follow late because of it
+    flight, _ = flown(folder, "motor_lag:0.05", 22)
+    noise = np.random.default_rng(3).normal(0, 3.0, (len(flight), 3))
+    noisy = replace(flight, specific_force=flight.specific_force + noise)
+    assert diagnosis(noisy).named("missing") == ()  # the rotors' speeds tell
+    alone = diagnosis(replace(noisy, rotor_speed=None))
+    assert alone.named("missing") == ()
+    assert "motor_lag" in verdict(alone, "rate_loop_lag").indistinguishable_from
+
+
+def test_thrust_of_the_rotors_leaves_only_what_lies_beyond_them(folder) -> None:
+    flight, _ = flown(folder, "motor_lag:0.05", 22)
+    assert diagnosis(thrust_from_rotors(flight)).named("missing") == ()
+    flight, hidden = flown(folder, "rotor_drag")
+    result = diagnosis(thrust_from_rotors(flight))
+    assert result.named("missing") == ("rotor_drag",)
+    assert verdict(result, "rotor_drag").parameters[0].value == pytest.approx(
+        hidden[0].parameters["x"], rel=0.03
+    )
+
+
+def test_thrust_of_rotors_that_nobody_recorded_is_refused(folder) -> None:
+    flight, _ = flown(folder, "none")
+    with pytest.raises(InputError, match="rotor_speed_1"):
+        thrust_from_rotors(replace(flight, rotor_speed=None))

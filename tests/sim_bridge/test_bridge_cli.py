@@ -15,7 +15,7 @@ from models.vehicle import Vehicle
 from sim_bridge.parameters import Parameters
 from sim_bridge.seal import reveal, seal
 from sim_bridge.settings import load_settings
-from sim_bridge.truth.hidden import EFFECTS, RICH, choose
+from sim_bridge.truth.hidden import EFFECTS, RICH, choose, pool
 
 VEHICLE = ("--vehicle", str(QUAD5 / "vehicle.toml"))
 
@@ -132,7 +132,9 @@ def test_effects_lists_what_can_be_hidden() -> None:
     listed = json.loads(command("effects", "--json").stdout)["effects"]
     assert [row["name"] for row in listed] == list(EFFECTS)
     assert {row["name"]: tuple(row["rich"]) for row in listed if row["rich"]} == RICH
-    assert {row["name"] for row in listed if not row["random"]} == {"estimator_delay", "payload"}
+    assert [row["name"] for row in listed if row["random"]] == pool("random")
+    assert [row["name"] for row in listed if row["any"]] == pool("any")
+    assert {"estimator_delay", "payload"}.isdisjoint(pool("any"))
 
 
 def test_a_flight_on_a_weak_battery_sinks_where_thrust_follows_the_voltage(tmp_path: Path) -> None:

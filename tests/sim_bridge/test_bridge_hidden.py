@@ -13,7 +13,7 @@ from models.frames import quaternion_from_euler, rotation_matrix
 from models.vehicle import GRAVITY, Vehicle
 from sim_bridge.simulator import Simulator
 from sim_bridge.truth.airframe import Airframe, believed_powertrain
-from sim_bridge.truth.hidden import EFFECTS, Hidden, choose, install
+from sim_bridge.truth.hidden import EFFECTS, Hidden, choose, install, pool
 from sim_bridge.truth.sensors import NO_NOISE, Sensors
 from sim_bridge.world import PHYSICS_STEP
 
@@ -232,3 +232,151 @@ def test_a_drawn_size_is_in_its_range_and_a_given_one_is_taken(vehicle: Vehicle,
 def test_what_cannot_be_hidden_is_refused(vehicle: Vehicle, bad: list[str]) -> None:
     with pytest.raises(InputError, match="--hidden"):
         choose(bad, vehicle, 0)
+
+
+@pytest.mark.parametrize("seed", STATES)
+def test_translational_lift_goes_with_the_airspeed_at_each_hub(vehicle: Vehicle, seed: int) -> None:
+    force, torque, _, velocity, _, rotation = added(
+        vehicle, Hidden("translational_lift", {"lift": 0.05}), seed
+    )
+    air, omega = rotation.T @ velocity[:3], velocity[3:]
+    expected_force, expected_torque = np.zeros(3), np.zeros(3)
+    for arm in vehicle.rotor_positions:
+        hub = air + np.cross(omega, arm)
+        lift = np.array([0.0, 0.0, vehicle.mass / 4 * 0.05 * (hub[0] ** 2 + hub[1] ** 2)])
+        expected_force += lift
+        expected_torque += np.cross(arm, lift)
+    assert rotation.T @ force == pytest.approx(expected_force)
+    assert torque[:2] == pytest.approx(expected_torque[:2])
+
+
+@pytest.mark.parametrize("seed", STATES)
+def test_ceiling_effect_is_the_published_law_at_each_hub(vehicle: Vehicle, seed: int) -> None:
+    hidden = Hidden("ceiling_effect", {"radius_factor": 2.0, "height": 1.6})
+    force, _, position, _, commands, rotation = added(vehicle, hidden, seed)
+    thrusts = vehicle.weight / 4 * commands / vehicle.hover_thrust
+    distance = 1.6 - position[2] - (np.array(vehicle.rotor_positions) @ rotation.T)[:, 2]
+    near = (2.0 * vehicle.rotor_radius / (distance + 0.0378)) ** 2 / 6.924
+    assert rotation[:, 2] @ force == pytest.approx((thrusts * (1 / (1 - np.minimum(near, 0.5)) - 1)).sum())
+
+
+def test_vortex_ring_takes_most_in_the_middle_of_its_range_and_nothing_outside(vehicle: Vehicle) -> None:
+    hidden = Hidden("vortex_ring", {"loss": 0.3})
+    disc = np.pi * vehicle.rotor_radius**2
+    induced = np.sqrt(vehicle.weight / 4 / (2 * 1.225 * disc))
+    hover = [vehicle.hover_thrust] * 4
+    level = [0, 0, 9, 1, 0, 0, 0]
+
+    def thrust(sinking: float, edgewise: float = 0.0) -> float:
+        velocity = [edgewise * induced, 0, -sinking * induced, 0, 0, 0]
+        return wrench_of(airframe_with(vehicle, hidden), level, velocity, hover)[0][2] / vehicle.weight
+
+    assert thrust(0.9) == pytest.approx(0.7)
+    assert thrust(0.2) == thrust(1.6) == thrust(-0.9) == pytest.approx(1.0)
+    assert 0.7 < thrust(0.9, 0.5) < thrust(0.9, 0.9) < 1.0
+
+
+@pytest.mark.parametrize("seed", STATES)
+def test_thrust_misalignment_turns_the_thrust_and_keeps_its_size(vehicle: Vehicle, seed: int) -> None:
+    hidden = Hidden("thrust_misalignment", {"angle": 0.05, "x": 0.03, "y": -0.04})
+    position, velocity, commands, rotation = random_state(seed)
+    force, _ = wrench_of(airframe_with(vehicle, hidden), position, velocity, commands)
+    thrust = vehicle.weight / 4 * commands.sum() / vehicle.hover_thrust
+    assert np.linalg.norm(force) == pytest.approx(thrust)
+    body = rotation.T @ force / thrust
+    assert body[:2] == pytest.approx(np.sin([0.03, -0.04]))
+
+
+@pytest.mark.parametrize("seed", STATES)
+def test_com_offset_is_the_torque_of_thrust_about_another_point(vehicle: Vehicle, seed: int) -> None:
+    hidden = Hidden("com_offset", {"distance": 0.01, "x": 0.006, "y": -0.008})
+    force, torque, _, _, commands, _ = added(vehicle, hidden, seed)
+    thrust = vehicle.weight / 4 * commands.sum() / vehicle.hover_thrust
+    assert force == pytest.approx(np.zeros(3), abs=1e-12)
+    assert torque == pytest.approx(-np.cross([0.006, -0.008, 0.0], [0.0, 0.0, thrust]))
+
+
+@pytest.mark.parametrize("rotor", [1, 2, 3, 4])
+def test_rotor_damage_takes_from_one_rotor_only(vehicle: Vehicle, rotor: int) -> None:
+    hidden = Hidden("rotor_damage", {"loss": 0.2, "rotor": float(rotor)})
+    force, torque, _, _, commands, rotation = added(vehicle, hidden, rotor)
+    lost = 0.2 * vehicle.weight / 4 * commands[rotor - 1] / vehicle.hover_thrust
+    assert rotation.T @ force == pytest.approx([0, 0, -lost])
+    arm = vehicle.rotor_positions[rotor - 1]
+    assert torque[:2] == pytest.approx(-np.cross(arm, [0, 0, lost])[:2])
+    assert np.sign(torque[2]) == vehicle.rotor_directions[rotor - 1]
+
+
+def test_gyroscopic_torque_keeps_the_momentum_of_rotors_and_body(vehicle: Vehicle) -> None:
+    inertia = 3e-5
+    airframe = airframe_with(vehicle, Hidden("gyroscopic", {"inertia": inertia}))
+    speeds = np.array([900.0, 1000.0, 1100.0, 800.0])
+    commands = (speeds / airframe.powertrain.hover_speed) ** 2 * vehicle.hover_thrust
+    rates = np.array([2.0, -1.0, 0.5])
+    state = [0, 0, 5, 1, 0, 0, 0], [0, 0, 0, *rates]
+    _, torque = wrench_of(airframe, *state, commands)
+    _, plain = wrench_of(airframe_with(vehicle), *state, commands)
+    momentum = np.array([0, 0, inertia * np.dot(vehicle.rotor_directions, speeds)])
+    assert torque - plain == pytest.approx(-np.cross(rates, momentum), abs=1e-9)
+    # the next step with the first pair faster: the body is turned against what the rotors gain
+    faster = commands * [1.2, 1.2, 1.0, 1.0]
+    out, same = np.zeros(6), np.zeros(6)
+    airframe.act(*state, list(faster), memoryview(out))
+    other = airframe_with(vehicle)
+    wrench_of(other, *state, commands)
+    other.act(*state, list(faster), memoryview(same))
+    assert (out[5] - same[5]) * sum(vehicle.rotor_directions[:2]) < 0
+
+
+def test_imu_lever_arm_is_felt_while_turning_and_not_in_hover(vehicle: Vehicle) -> None:
+    arm = np.array([0.05, 0.0, 0.02])
+    hidden = Hidden("imu_lever_arm", {"length": 0.054, **dict(zip("xyz", arm.tolist(), strict=True))})
+    readings = []
+    for one in ((hidden,), ()):
+        simulator = Simulator(vehicle, one, noise=NO_NOISE)
+        simulator.start_in_hover((0.0, 0.0, 5.0))
+        told = []
+        for i in range(400):
+            simulator.step(vehicle.hover_thrust, 0.0, 0.0, 0.0 if i < 100 else 2.0)
+            now = simulator.estimate()
+            told.append((*now.specific_force, *now.angular_velocity))
+        readings.append(np.array(told))
+    with_it, without = readings
+    swing = (with_it - without)[:, :3]
+    assert swing[:100] == pytest.approx(np.zeros((100, 3)), abs=1e-9)
+    rates = without[:, 3:]
+    slope = np.gradient(rates, PHYSICS_STEP, axis=0)
+    expected = np.cross(slope, arm) + np.cross(rates, np.cross(rates, arm))
+    # the simulator's is the mean of a step, this one of two
+    assert np.max(np.abs(swing - expected)[110:]) < 0.05 * np.max(np.abs(expected))
+
+
+def test_rate_loop_lag_filters_the_commanded_rates(vehicle: Vehicle) -> None:
+    def response(*hidden: Hidden) -> np.ndarray:
+        simulator = Simulator(vehicle, hidden, noise=NO_NOISE)
+        simulator.start_in_hover((0.0, 0.0, 50.0))
+        rates = []
+        for _ in range(500):
+            simulator.step(vehicle.hover_thrust, 0.2, 0.0, 0.0)
+            rates.append(simulator.estimate().angular_velocity[0])
+        return np.array(rates)
+
+    late = response(Hidden("rate_loop_lag", {"time_constant": 0.08}))
+    missing = (response() - late).sum() * PHYSICS_STEP / 0.2
+    assert missing == pytest.approx(0.08, rel=0.05)  # the area that a first-order filter in front takes away
+
+
+def test_any_draws_from_more_and_random_from_what_it_always_did(vehicle: Vehicle) -> None:
+    assert pool("random") == [
+        *("thrust_gain", "thrust_curve", "battery_sag", "motor_lag", "transport_delay", "rotor_drag"),
+        *("parasitic_drag", "ground_effect", "wind", "accelerometer_bias"),
+    ]
+    assert set(pool("any")) > set(pool("random"))
+    # what these seeds hid when there were only the first ten
+    drawn = [choose(["random"], vehicle, seed)[0].name for seed in range(1, 11)]
+    assert drawn == [
+        *("motor_lag", "parasitic_drag", "transport_delay", "thrust_curve", "wind", "parasitic_drag"),
+        *("battery_sag", "rotor_drag", "battery_sag", "ground_effect"),
+    ]
+    assert {choose(["any"], vehicle, seed)[0].name for seed in range(300)} == set(pool("any"))
+    assert choose(["any"], vehicle, 4, 3) == choose(["any"], vehicle, 4, 3)
