@@ -230,7 +230,8 @@ def _by_dask(
         raise InputError(
             "Dask is not installed; pip install 'trueflight[cluster]', or pass --jobs 1 to do without"
         ) from None
-    dask.config.set({"distributed.scheduler.allowed-failures": 1})
+    # the profiler of a worker keeps every stack it has seen
+    dask.config.set({"distributed.scheduler.allowed-failures": 1, "distributed.worker.profile.enabled": False})
     cluster = None
     try:
         if scheduler is None:
