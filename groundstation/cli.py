@@ -11,8 +11,11 @@ from groundstation import (
     effect_commands,
     flight_commands,
     pilot_commands,
+    plan_commands,
+    remainder_commands,
     report_commands,
     reproduce_commands,
+    survey_commands,
     train_commands,
 )
 from models.errors import run_command_line
@@ -35,6 +38,9 @@ pilot_commands.register(app)
 collect_commands.register(app)
 effect_commands.register(app)
 reproduce_commands.register(app)
+remainder_commands.register(app)
+plan_commands.register(app)
+survey_commands.register(app)
 
 
 def main() -> None:

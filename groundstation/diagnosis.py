@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from scipy import stats
@@ -158,6 +157,7 @@ class _Search:
         self.beside: tuple[str, ...] = ()
         """Effects fitted in every state without being judged."""
         self._states: dict[frozenset[str], _State] = {}
+        self._errors_before: dict[bool, float] = {}
 
     @property
     def flight(self) -> Flight:
@@ -526,9 +526,14 @@ class _Search:
             and all(fitted.estimate[i] < 1.0 for i in fitted.of(name))
         )
 
-    @cache  # noqa: B019 - a search lives as long as its diagnosis
     def _before(self, held_out: bool = False) -> float:
         """Mean squared error of the base model as it stands, nothing refitted but the clock."""
+        # not functools.cache: it would keep every search of a long survey alive
+        if held_out not in self._errors_before:
+            self._errors_before[held_out] = self._error_before(held_out)
+        return self._errors_before[held_out]
+
+    def _error_before(self, held_out: bool) -> float:
         problem = self.held_out if held_out and self.held_out is not None else self.problem
         chain = with_clock(problem.measurements[0], self.base.chain())
         alone = [(effect, values) for effect, values in chain if effect.stage is not Stage.REMAINDER]

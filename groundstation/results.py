@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -119,13 +119,64 @@ class WaterfallStep:
 
 
 @dataclass(frozen=True)
+class SpectralLine:
+    """A narrow peak of the residual's spectrum: `frequency` in Hz, `rms` in m/s² on `axis` (body "x", "y", "z").
+
+    `in_band` where it lies below the bandwidth of the comparison, so that models are judged with it; `text` says what
+    it may be.
+    """
+
+    frequency: float
+    axis: str
+    rms: float
+    p_value: float
+    in_band: bool
+    text: str
+
+
+@dataclass(frozen=True)
+class FormulaTerm:
+    """`coefficient` times `term` on body axis `axis`, m/s²; 95 % interval from leaving out blocks; `unit` of the
+    coefficient."""
+
+    axis: str
+    term: str
+    coefficient: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class SparseFormula:
+    """A short formula for what no effect explains. `variance_share` is the part of what varies in the
+    residual (squared, about its mean) that it takes away on held-out blocks."""
+
+    text: str
+    terms: tuple[FormulaTerm, ...]
+    variance_share: float
+
+
+@dataclass(frozen=True)
 class Unexplained:
     """Whether predictable structure is left, its share of the remaining squared error, and what it goes
-    with."""
+    with.
+
+    `p_value` is that of the structure against residuals of the same spectrum without it; `variables` the shares that
+    go with each variable, `axes` and `moments` (start, end in s, share) where the structure acts, `lines` the narrow
+    peaks of the spectrum, `formula` a short formula where one was found.
+    """
 
     verdict: bool
     variance_share: float
     where: tuple[str, ...]
+    p_value: float = 1.0
+    variables: dict[str, float] = field(default_factory=dict)
+    axes: dict[str, float] = field(default_factory=dict)
+    moments: tuple[tuple[float, float, float], ...] = ()
+    lines: tuple[SpectralLine, ...] = ()
+    formula: SparseFormula | None = None
+    advice: str = ""
 
 
 @dataclass(frozen=True)

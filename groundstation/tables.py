@@ -121,7 +121,7 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
     if d.unexplained.verdict:
         console.print(
             f"Unexplained: {percent(d.unexplained.variance_share)} of what is left can be predicted but fits no known "
-            f"effect: {'; '.join(d.unexplained.where)}",
+            f"effect: {'; '.join(d.unexplained.where)}. More: groundstation remainder FLIGHT",
             style="yellow",
         )
     if absent := d.named("not_supported"):

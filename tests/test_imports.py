@@ -15,7 +15,8 @@ ALLOWED = {
     "companion": {"companion", "mavsdk", "zenoh", "onnxruntime", "mcap", "google"},
     "groundstation": {
         "groundstation", "torch", "control", "scipy", "statsmodels", "rerun", "pyarrow", "pyulog", "onnx",
-        "onnxruntime", "mcap", "google", "zenoh", "jinja2", "markupsafe", "matplotlib",
+        "onnxruntime", "mcap", "google", "zenoh", "jinja2", "markupsafe", "matplotlib", "dask",
+        "distributed",
     },
     "sim_bridge": {"sim_bridge", "companion", "mujoco", "pymavlink", "scipy", "mcap", "google", "onnxruntime"},
 }  # fmt: skip

@@ -1,0 +1,33 @@
+"""Flights of the simulator, in-process and read back as any other flight."""
+
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from groundstation.reading import read_flight
+from models.design import load_design
+from models.flight import Flight
+from models.reference import trajectory
+from models.trajectory import Trajectory
+from models.vehicle import load_vehicle
+from sim_bridge.in_process import Plan, record
+from sim_bridge.truth.hidden import choose
+from sim_bridge.truth.sensors import Noise
+
+VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
+
+
+def fly(path: Path, hidden: tuple[str, ...], seed: int, flown: Trajectory) -> None:
+    """Fly into the record `path`, with the sensors' noise."""
+    vehicle = load_vehicle(VEHICLE)
+    design = load_design(VEHICLE.with_name("design.json"), vehicle)
+    record(Plan(vehicle, design, flown, choose(list(hidden), vehicle, seed), seed, noise=Noise()), path)
+
+
+@cache
+def simulated(seed: int, *hidden: str, kind: str = "excitation") -> Flight:
+    """A flight of a named trajectory."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{kind}-{seed}.mcap"
+        fly(path, hidden or ("none",), seed, trajectory(kind))
+        return read_flight(path)
