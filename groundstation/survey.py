@@ -231,7 +231,9 @@ def _by_dask(
             "Dask is not installed; pip install 'trueflight[cluster]', or pass --jobs 1 to do without"
         ) from None
     # the profiler of a worker keeps every stack it has seen
-    dask.config.set({"distributed.scheduler.allowed-failures": 1, "distributed.worker.profile.enabled": False})
+    dask.config.set(
+        {"distributed.scheduler.allowed-failures": 1, "distributed.worker.profile.enabled": False}
+    )
     cluster = None
     try:
         if scheduler is None:

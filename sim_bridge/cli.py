@@ -35,7 +35,8 @@ VehicleFile = Annotated[
 ]
 Config = Annotated[Path | None, typer.Option(help="Configuration (sim-bridge.toml); flags override it.")]
 HiddenNames = Annotated[
-    list[str] | None, typer.Option(help="Effect to hide: NAME, NAME:SIZE, rich, random, any, none. Repeatable.")
+    list[str] | None,
+    typer.Option(help="Effect to hide: NAME, NAME:SIZE, rich, random, any, none. Repeatable."),
 ]
 HiddenCount = Annotated[int | None, typer.Option(help="How many effects `random` or `any` draws.")]
 Seed = Annotated[int | None, typer.Option(help="Of the draw and of the noise.")]
