@@ -69,12 +69,12 @@ def collect(
     generator is closed or interrupted, flights under way are finished and kept, and the rest is not begun.
     """
     missing = [flight for flight in wanted if flight.name not in collection.flown]
-    if jobs <= 1 or len(missing) <= 1:
-        for flight in missing:
-            yield flight, _kept(collection, flight, _fly(flight, collection.folder))
+    if not missing:
         return
     # A fresh interpreter each: forking a process that has threads (the progress bar's) may hang.
-    pool = ProcessPoolExecutor(min(jobs, len(missing)), get_context("spawn"), _leave_interrupts_to_parent)
+    pool = ProcessPoolExecutor(
+        max(1, min(jobs, len(missing))), get_context("spawn"), _leave_interrupts_to_parent
+    )
     under_way = {pool.submit(_fly, flight, collection.folder): flight for flight in missing}
     try:
         for done in as_completed(list(under_way)):

@@ -37,19 +37,19 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object]]:
-    """A minute and a half of flight, in one process."""
+    """Three minutes of flight, in one process."""
     folder = tmp_path_factory.mktemp("collect") / "one"
-    done = collect(folder, "--minutes", "1.5", "--jobs", "1")
+    done = collect(folder, "--minutes", "3", "--jobs", "1")
     assert done.returncode == 0, done.stderr
     return folder, json.loads(done.stdout)
 
 
 def test_a_collection_holds_the_database_one_record_a_flight(collected) -> None:
     folder, report = collected
-    sorties = database(2, 1.5)
+    sorties = database(2, 3.0)
     names = [f"{number:03d}-{sortie.trajectory}.mcap" for number, sortie in enumerate(sorties, 1)]
     assert sorted(contents(folder)) == [*names, "collection.json", "hidden.sealed"]
-    assert report["seconds"] >= 90.0 and list(report["flights"]) == names
+    assert report["seconds"] >= 180.0 and list(report["flights"]) == names
     for name, sortie in zip(names, sorties, strict=True):
         read = read_record(folder / name)
         assert not read.truncated and read.metadata["trajectory"] == sortie.trajectory
@@ -61,11 +61,11 @@ def test_a_collection_holds_the_database_one_record_a_flight(collected) -> None:
 
 def test_two_processes_write_the_same_bytes_and_a_second_call_writes_none(collected, tmp_path: Path) -> None:
     folder, _ = collected
-    done = collect(tmp_path / "two", "--minutes", "1.5", "--jobs", "2")
+    done = collect(tmp_path / "two", "--minutes", "3", "--jobs", "2")
     assert done.returncode == 0, done.stderr
     assert contents(tmp_path / "two") == contents(folder)
     stamps = {path: path.stat().st_mtime_ns for path in (tmp_path / "two").glob("*.mcap")}
-    again = json.loads(collect(tmp_path / "two", "--minutes", "1.5").stdout)
+    again = json.loads(collect(tmp_path / "two", "--minutes", "3").stdout)
     assert again["flown_now"] == 0
     assert stamps == {path: path.stat().st_mtime_ns for path in stamps}
 
@@ -73,7 +73,7 @@ def test_two_processes_write_the_same_bytes_and_a_second_call_writes_none(collec
 def test_what_was_flown_before_an_interruption_stays_and_the_rest_follows(collected, tmp_path: Path) -> None:
     folder, _ = collected
     target = tmp_path / "cut"
-    command = [*PROGRAM, *RICH, "-o", str(target), "--minutes", "1.5", "--jobs", "1"]
+    command = [*PROGRAM, *RICH, "-o", str(target), "--minutes", "3", "--jobs", "1"]
     child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     end = time.monotonic() + 60
     while not list(target.glob("*.mcap")) and time.monotonic() < end:
@@ -85,17 +85,17 @@ def test_what_was_flown_before_an_interruption_stays_and_the_rest_follows(collec
     assert 0 < len(kept) < len(contents(folder)) - 2
     assert not [name for name in contents(target) if name.endswith(".part")]
     assert all(contents(folder)[name] == data for name, data in kept.items())
-    assert collect(target, "--minutes", "1.5").returncode == 0
+    assert collect(target, "--minutes", "3").returncode == 0
     assert contents(target) == contents(folder)
 
 
 def test_other_settings_and_foreign_folders_are_refused(collected, tmp_path: Path) -> None:
     folder, _ = collected
     for more, says in (
-        (("--minutes", "2"), "begun with minutes 1.5, now 2.0"),
-        (("--minutes", "1.5", "--noise", "0"), "begun with noise 1.0, now 0.0"),
+        (("--minutes", "2"), "begun with minutes 3.0, now 2.0"),
+        (("--minutes", "3", "--noise", "0"), "begun with noise 1.0, now 0.0"),
         (("--minutes", "0"), "--minutes 0"),
-        (("--minutes", "1.5", "--rate", "120"), "must divide"),
+        (("--minutes", "3", "--rate", "120"), "must divide"),
     ):
         done = collect(folder, *more)
         assert done.returncode == 2 and says in done.stderr
