@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from groundstation.linear_design import Loop
     from groundstation.tracking import Tracking
     from models.flight import Flight
+    from models.vehicle import Vehicle
 
 console = Console()
 
@@ -35,7 +37,7 @@ def register(app: typer.Typer) -> None:
     app.command(
         "import",
         epilog="Example: groundstation import log.csv --mapping mine.mapping.toml --vehicle vehicle.toml "
-        "-o flight.csv",
+        "-o flight.csv; groundstation import log.ulg --draft-vehicle vehicle.toml",
     )(import_command)
     app.command(
         "design", epilog="Example: groundstation design models/vehicles/quad5/vehicle.toml -o design.json"
@@ -161,23 +163,48 @@ def _record_facts(file: Path) -> dict[str, Any]:
 
 def import_command(
     file: FlightFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Where to: .csv or .parquet.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Where to: .csv or .parquet.")] = None,
     vehicle: VehicleOption = None,
     mapping: MappingOption = None,
+    draft: Annotated[
+        Path | None,
+        typer.Option("--draft-vehicle", help="Draft a vehicle file from a PX4 log; never replaces one."),
+    ] = None,
+    mass: Annotated[float | None, typer.Option(help="kg, for the draft: PX4 does not know it.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Read any flight, check it, and write it in the project's own format with its vehicle file beside it."""
+    """Read any flight, check it, and write it in the project's own format with its vehicle file beside it.
+
+    From a PX4 ULog a vehicle file can be drafted first: `--draft-vehicle vehicle.toml`, with or without `-o`.
+    """
     from groundstation.reading import read_flight
     from groundstation.reading.writing import own_table, write_flight
 
-    if output.resolve() == file.resolve():
+    if output is None and draft is None:
+        raise InputError("import: say where to write the flight with -o FILE.csv, or draft its vehicle file")
+    if output is not None and output.resolve() == file.resolve():
         raise InputError(f"{output}: that is the file itself; choose another -o, the original stays as it is")
-    flight = read_flight(file, vehicle, mapping)
+    if mass is not None and draft is None:
+        raise InputError("--mass goes with --draft-vehicle; a vehicle file of your own tells its mass itself")
+    drafted: dict[str, Any] = {}
+    believed: Path | Vehicle | None = vehicle
+    if draft is not None:
+        if vehicle is not None:
+            raise InputError(
+                "--draft-vehicle: leave out --vehicle, the draft is what the log tells without it"
+            )
+        believed, drafted = _draft(file, draft, mass, as_json)
+    if output is None:
+        if as_json:
+            typer.echo(json.dumps(drafted, indent=1))
+        return
+    flight = read_flight(file, believed, mapping)
     vehicle_path = write_flight(flight, output)
     if as_json:
         typer.echo(
             json.dumps(
                 {
+                    **drafted,
                     "flight": str(output),
                     "vehicle": str(vehicle_path),
                     "samples": len(flight),
@@ -194,6 +221,45 @@ def import_command(
     )
     console.print(f"{escape(str(vehicle_path))}: the vehicle as it was believed to be")
     _print_notes(flight)
+
+
+def _draft(file: Path, target: Path, mass: float | None, quiet: bool) -> tuple[Vehicle, dict[str, Any]]:
+    """Draft the vehicle file of a PX4 log; what it says, for a program."""
+    from rich.table import Table
+
+    from groundstation.reading.flight_file import ULOGS
+    from groundstation.reading.px4_log import load_ulog
+    from groundstation.vehicle_draft import draft_vehicle, write_draft
+
+    if file.suffix.lower() not in ULOGS:
+        raise InputError(f"{file}: only a PX4 ULog holds the parameters that a vehicle file is drafted from")
+    if target.exists():
+        raise InputError(f"{target}: there is a file already; a draft never replaces one, name another")
+    drafted = draft_vehicle(load_ulog(file), mass)
+    write_draft(drafted, target)
+    if not quiet:
+        table = Table(title=f"{escape(str(target))}: drafted from {escape(file.name)}", title_justify="left")
+        table.add_column("value", overflow="fold")
+        table.add_column("where it is from", overflow="fold")
+        for line in drafted.lines:
+            if line.key == "rotor_directions" and not line.stated:
+                continue
+            mark = "" if line.complete else "[yellow]TO COMPLETE[/yellow] "
+            value = f"{line.key} = {line.value}" if line.stated else f"{line.key} (left out)"
+            table.add_row(escape(value), mark + escape(line.source))
+        console.print(table)
+        console.print(
+            f"[yellow]the log cannot tell {escape(', '.join(drafted.to_complete))}[/yellow]: correct them in "
+            f"{escape(str(target))}",
+            highlight=False,
+        )
+    values = tomllib.loads(drafted.text)
+    return drafted.vehicle, {
+        "vehicle_draft": str(target),
+        "values": values,
+        "sources": {line.key: line.source for line in drafted.lines},
+        "to_complete": list(drafted.to_complete),
+    }
 
 
 def design_command(

@@ -174,9 +174,14 @@ def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:
         return load_vehicle(vehicle)
     if (beside := _beside(path, "vehicle.toml")) is not None:
         return load_vehicle(beside)
+    draft = (
+        f"; `groundstation import {path} --draft-vehicle vehicle.toml` drafts one from the log"
+        if path.suffix.lower() in ULOGS
+        else ""
+    )
     raise InputError(
         f"{path}: no vehicle.toml beside it; pass --vehicle FILE (mass, hover_thrust and rotors as you "
-        "believe them)"
+        f"believe them){draft}"
     )
 
 
