@@ -15,12 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from groundstation.reading.px4_flight import (
+    ACCELEROMETER,
+    FAST,
     RATE,
     Airborne,
     airborne,
     battery_in_use,
     check_multirotor,
+    ground_level,
     motor_count,
+    period_mean,
 )
 from groundstation.reading.px4_log import Log
 from groundstation.reading.px4_thrust import commanded_thrust
@@ -30,6 +34,7 @@ from models.vehicle import GRAVITY, Vehicle, vehicle_from_table
 STAND_IN_MASS = 1.0  # kg
 CELL = 3.7  # V, a lithium cell in the middle of its discharge
 SLOW = 1.5  # m/s; below it drag is small beside the thrust
+CLEAR = 0.5  # m above the ground
 SETTLED = 3.0  # s of slow flight from which a hover thrust is measured
 PROPELLER = 0.45
 """Radius of a propeller in distances of neighbouring rotors, usual for a quadrotor whose propellers nearly touch."""
@@ -258,20 +263,22 @@ def _hover(log: Log, air: Airborne | None) -> tuple[float | None, str]:
         return None, ""
     command = np.interp(air.clock, thrust.t, thrust.values)
     rows = air.in_air & (command > 0.02) & (command < 0.98)
-    local = log.topic("vehicle_local_position", "vx", "vy", "vz")
+    local = log.topic("vehicle_local_position", "z", "vx", "vy", "vz")
     slow = rows
     if local is not None:
         speed = np.interp(air.clock, local.t, np.linalg.norm(local.stack("vx", "vy", "vz"), axis=1))
-        slow = rows & (speed < SLOW)
+        height = -np.interp(air.clock, local.t, local.fields["z"])
+        # On the ground the accelerometer feels gravity whatever the rotors do.
+        slow = rows & (speed < SLOW) & (height - ground_level(height, air)[0] > CLEAR)
     if slow.sum() < SETTLED * RATE:
         return None, ""
-    felt = log.topic("sensor_combined", "accelerometer_m_s2[2]")
-    if felt is None or felt.rate_within(*air.span) < 20.0:
+    felt = log.topic("sensor_combined", *ACCELEROMETER)
+    if felt is None or felt.rate_within(*air.span) < FAST:
         return float(np.median(command[slow])), f"median command of {slow.sum() / RATE:.0f} s of slow flight"
-    force = -float(np.mean(np.interp(air.clock[slow], felt.t, felt.fields["accelerometer_m_s2[2]"])))
+    force = -float(np.median(period_mean(felt.t, felt.stack(*ACCELEROMETER), air.clock)[slow, 2]))
     if not 0.5 * GRAVITY < force < 2.0 * GRAVITY:
         return None, ""
-    hover = float(np.mean(command[slow])) * GRAVITY / force
+    hover = float(np.median(command[slow])) * GRAVITY / force
     return hover, f"measured over {slow.sum() / RATE:.0f} s of slow flight, against the accelerometer"
 
 

@@ -294,7 +294,7 @@ def _motion(
     ned = [np.stack([np.interp(clock, topic.t, c) for c in v.T], -1) for v in (position, velocity)]
     at = {"position": enu_from_ned(ned[0]), "velocity": enu_from_ned(ned[1])}
     at |= _references(log, air)
-    ground, said = _ground(at["position"][:, 2], air)
+    ground, said = ground_level(at["position"][:, 2], air)
     at["position"][:, 2] -= ground
     if "position_reference" in at:
         at["position_reference"][:, 2] -= ground
@@ -364,9 +364,9 @@ def _odometry(log: Log, air: Airborne, attitude: np.ndarray) -> tuple[Topic, np.
     return kept, position[good], velocity[good]
 
 
-def _ground(height: np.ndarray, air: Airborne) -> tuple[np.ndarray, list[str]]:
-    """Height (N,) of the ground that the vehicle stood on before each takeoff: an estimate drifts, and the next
-    takeoff may be elsewhere."""
+def ground_level(height: np.ndarray, air: Airborne) -> tuple[np.ndarray, list[str]]:
+    """Height (N,) of the ground that the vehicle stood on before each takeoff, and what to say of it: an estimate
+    drifts, and the next takeoff may be elsewhere."""
     ground = np.zeros(len(height))
     known: list[float] = []
     end = 0
@@ -395,18 +395,18 @@ def _inertial(log: Log, air: Airborne) -> tuple[dict[str, np.ndarray], list[Topi
         return topic if topic is not None and topic.rate_within(first, last) >= FAST else None
 
     if (raw := fast("sensor_combined", *ACCELEROMETER)) is not None:
-        out["specific_force"] = flu_from_frd(_mean(raw.t, raw.stack(*ACCELEROMETER), air.clock))
+        out["specific_force"] = flu_from_frd(period_mean(raw.t, raw.stack(*ACCELEROMETER), air.clock))
         used.append(raw)
     elif (filtered := fast("vehicle_acceleration", *XYZ)) is not None:
-        out["specific_force"] = flu_from_frd(_mean(filtered.t, filtered.stack(*XYZ), air.clock))
+        out["specific_force"] = flu_from_frd(period_mean(filtered.t, filtered.stack(*XYZ), air.clock))
         used.append(filtered)
         notes.append("the accelerometer is PX4's filtered vehicle_acceleration")
     else:
         notes.append(f"no accelerometer of {FAST:.0f} Hz or more in the log (sensor_combined)")
     if (rates := fast("vehicle_angular_velocity", *XYZ)) is not None:
-        out["angular_velocity"] = flu_from_frd(_mean(rates.t, rates.stack(*XYZ), air.clock))
+        out["angular_velocity"] = flu_from_frd(period_mean(rates.t, rates.stack(*XYZ), air.clock))
     elif (gyro := fast("sensor_combined", *GYROSCOPE)) is not None:
-        out["angular_velocity"] = flu_from_frd(_mean(gyro.t, gyro.stack(*GYROSCOPE), air.clock))
+        out["angular_velocity"] = flu_from_frd(period_mean(gyro.t, gyro.stack(*GYROSCOPE), air.clock))
     return out, used, notes
 
 
@@ -517,7 +517,7 @@ def _interpolated(t: np.ndarray, values: np.ndarray, clock: np.ndarray) -> np.nd
     return np.where((clock < t[0]) | (clock > t[-1] + 0.5), np.nan, out)
 
 
-def _mean(t: np.ndarray, values: np.ndarray, clock: np.ndarray) -> np.ndarray:
+def period_mean(t: np.ndarray, values: np.ndarray, clock: np.ndarray) -> np.ndarray:
     """Mean of samples (M, 3) over one period around each time, from their running integral."""
     good = np.all(np.isfinite(values), axis=1)
     t, values = t[good], values[good]
