@@ -122,6 +122,7 @@ SHORT = {
 def _flight_row(file: Path, directory: Path) -> dict[str, Any]:
     """What the table tells of one file; a file that cannot be read tells why."""
     from groundstation.reading import read_flight
+    from groundstation.reading.ros_bag import is_ros_bag
 
     stamp = datetime.fromtimestamp(file.stat().st_mtime, UTC)
     row: dict[str, Any] = {
@@ -134,7 +135,7 @@ def _flight_row(file: Path, directory: Path) -> dict[str, Any]:
     }
     try:
         flight = read_flight(file)
-        if file.suffix.lower() == ".mcap":
+        if file.suffix.lower() == ".mcap" and not is_ros_bag(file):
             row |= _record_facts(file)
     except InputError as error:
         return {**row, "error": str(error)}

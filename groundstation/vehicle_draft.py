@@ -33,7 +33,7 @@ from models.vehicle import GRAVITY, Vehicle, vehicle_from_table
 
 STAND_IN_MASS = 1.0  # kg
 CELL = 3.7  # V, a lithium cell in the middle of its discharge
-SLOW = 1.5  # m/s; below it drag is small beside the thrust
+SLOW = 1.0  # m/s; below it drag is small beside the thrust
 CLEAR = 0.5  # m above the ground
 SETTLED = 3.0  # s of slow flight from which a hover thrust is measured
 PROPELLER = 0.45

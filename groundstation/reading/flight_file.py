@@ -24,8 +24,8 @@ ULOGS = (".ulg", ".ulog")
 def read_flight(
     path: str | Path, vehicle: str | Path | Vehicle | None = None, mapping: str | Path | None = None
 ) -> Flight:
-    """Read a flight: the project's CSV or Parquet, any table through a column `mapping`, MCAP record or PX4
-    ULog.
+    """Read a flight: the project's CSV or Parquet, any table through a column `mapping`, MCAP record, MCAP of
+    ROS 2, or PX4 ULog.
 
     `vehicle` is a vehicle or its file; without it the one beside the flight is taken (a record of the
     companion carries its own): `NAME.vehicle.toml` with the longest NAME that the flight's name starts with,
@@ -38,6 +38,11 @@ def read_flight(
         raise InputError(f"{path}: no such file; check the path (`groundstation flights DIR` lists flights)")
     if suffix in RECORDS:
         from groundstation.reading.flight_record import read_flight_record
+        from groundstation.reading.px4_flight import flight_of
+        from groundstation.reading.ros_bag import is_ros_bag, load_ros_bag
+
+        if is_ros_bag(path):
+            return flight_of(path, load_ros_bag(path), _vehicle(path, vehicle))
 
         return read_flight_record(path, vehicle)
     if suffix in ULOGS:

@@ -156,8 +156,7 @@ def airborne(log: Log) -> tuple[Airborne, list[str]]:
     needed = [topic for name in names if (topic := log.topic(name)) is not None]
     if not needed:
         raise InputError(
-            f"{origin}: neither vehicle_attitude nor sensor_combined is in the log (cut short?); log with PX4's "
-            "default profile (SDLOG_PROFILE 1)"
+            f"{origin}: neither vehicle_attitude nor sensor_combined is in the log (cut short?); {log.advice}"
         )
     begin, end = max(t.t[0] for t in needed), min(t.t[-1] for t in needed)
     notes: list[str] = []
@@ -255,9 +254,7 @@ def _heading(log: Log, air: Airborne) -> list[str]:
 def _attitude(log: Log, air: Airborne) -> tuple[np.ndarray, list[str]]:
     topic = log.topic("vehicle_attitude", *ATTITUDE) or log.topic("vehicle_odometry", *ATTITUDE)
     if topic is None:
-        raise InputError(
-            f"{log.origin}: vehicle_attitude is not in the log; log it (PX4's default profile does)"
-        )
+        raise InputError(f"{log.origin}: vehicle_attitude is not in the log; {log.advice}")
     q = topic.stack(*ATTITUDE)
     good = np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.02
     if good.sum() < 2:
@@ -265,7 +262,7 @@ def _attitude(log: Log, air: Airborne) -> tuple[np.ndarray, list[str]]:
     turned = continuous_quaternion(enu_flu_from_ned_frd(q[good]))
     at = np.stack([np.interp(air.clock, topic.t[good], c) for c in turned.T], -1)
     notes = [] if topic.name == "vehicle_attitude" else ["attitude is that of vehicle_odometry"]
-    notes += _slow(topic, air, "attitude")
+    notes += _slow(log, topic, air, "attitude")
     return at / np.linalg.norm(at, axis=1, keepdims=True), notes
 
 
@@ -275,14 +272,15 @@ def _motion(
     """Position, velocity and the position that was followed, ENU; heights above the ground at each takeoff. And where
     (N,) the estimate can be used."""
     clock = air.clock
-    local, odometry = log.topic("vehicle_local_position", "x", "y", "z", "vx", "vy", "vz"), None
+    local = log.topic("vehicle_local_position", "x", "y", "z")
     usable = np.ones(len(clock), dtype=bool)
     notes: list[str] = []
     if local is not None and (notes_of := _invalid(local, air)) is not None:
         notes.append(notes_of)
         local = None
     if local is not None:
-        topic, position, velocity = local, local.stack("x", "y", "z"), local.stack("vx", "vy", "vz")
+        topic, position = local, local.stack("x", "y", "z")
+        velocity = local.first_of(("vx", "vy", "vz"))
         usable, notes = _valid(local, air)
     else:
         odometry = _odometry(log, air, attitude)
@@ -290,9 +288,12 @@ def _motion(
             return {}, usable, notes or ["the log has no position"]
         topic, position, velocity = odometry
         notes.append("position and velocity are those of vehicle_odometry")
-    notes += _slow(topic, air, "position")
-    ned = [np.stack([np.interp(clock, topic.t, c) for c in v.T], -1) for v in (position, velocity)]
-    at = {"position": enu_from_ned(ned[0]), "velocity": enu_from_ned(ned[1])}
+    notes += _slow(log, topic, air, "position")
+    at = {
+        name: enu_from_ned(np.stack([np.interp(clock, topic.t, c) for c in ned.T], -1))
+        for name, ned in (("position", position), ("velocity", velocity))
+        if ned is not None
+    }
     at |= _references(log, air)
     ground, said = ground_level(at["position"][:, 2], air)
     at["position"][:, 2] -= ground
@@ -420,8 +421,7 @@ def _commands(log: Log, air: Airborne, vehicle: Vehicle) -> tuple[dict[str, np.n
     if thrust is None:
         raise InputError(
             f"{log.origin}: no thrust command in the log (vehicle_thrust_setpoint, actuator_controls_0, "
-            "vehicle_rates_setpoint, actuator_motors, actuator_outputs, esc_status); log with PX4's default profile "
-            "(SDLOG_PROFILE 1) or high rate (3)"
+            f"vehicle_rates_setpoint, actuator_motors, actuator_outputs, esc_status); {log.advice}"
         )
     values = np.where(armed, np.nan_to_num(_interpolated(thrust.t, thrust.values, clock)), 0.0)
     notes = [f"thrust is {thrust.said}, logged at {thrust.rate:.0f} Hz"]
@@ -467,12 +467,12 @@ def _references(log: Log, air: Airborne) -> dict[str, np.ndarray]:
     return {}
 
 
-def _slow(topic: Topic, air: Airborne, what: str) -> list[str]:
+def _slow(log: Log, topic: Topic, air: Airborne, what: str) -> list[str]:
     """A note where a topic is logged more slowly than a manoeuvre lasts."""
     rate = topic.rate_within(*air.span)
     if rate >= 0.9 * RATE / 2:
         return []
-    return [f"{what} is logged at {rate:.0f} Hz and interpolated; SDLOG_PROFILE 3 logs manoeuvres faster"]
+    return [f"{what} is logged at {rate:.0f} Hz and interpolated; {log.faster}"]
 
 
 def _recorded(clock: np.ndarray, topics: list[Topic]) -> np.ndarray:

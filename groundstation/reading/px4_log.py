@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,7 +79,8 @@ class Topic:
 @dataclass(frozen=True)
 class Log:
     """A log: the instances of each topic by name, parameters at its start, their later changes (time in s, name,
-    value), and what the file itself had to tell."""
+    value), and what the file itself had to tell. `advice` says how to record what is missing, `faster` how to record
+    more of it."""
 
     origin: str
     topics: dict[str, tuple[Topic, ...]]
@@ -87,6 +89,8 @@ class Log:
     version: str = ""
     hardware: str = ""
     notes: tuple[str, ...] = ()
+    advice: str = "log with PX4's default profile (SDLOG_PROFILE 1)"
+    faster: str = "SDLOG_PROFILE 3 logs manoeuvres faster"
 
     def topic(self, name: str, *needed: str) -> Topic | None:
         """The first instance of a topic that has the needed fields."""
@@ -125,8 +129,10 @@ def load_ulog(path: Path) -> Log:
     return Log(
         str(path),
         collect((d.name, int(d.multi_id), dict(d.data)) for d in log.data_list),
-        {name: float(value) for name, value in log.initial_parameters.items()},
-        tuple((1e-6 * t, name, float(value)) for t, name, value in log.changed_parameters),
+        {name: float(value) for name, value in log.initial_parameters.items() if _is_number(value)},
+        tuple(
+            (1e-6 * t, name, float(value)) for t, name, value in log.changed_parameters if _is_number(value)
+        ),
         _version(release),
         str(log.msg_info_dict.get("ver_hw", "")),
         tuple(notes),
@@ -189,6 +195,11 @@ def _version(release: tuple[int, int, int, int] | None) -> str:
     major, minor, patch, kind = release
     word = {0: "dev", 64: "alpha", 128: "beta", 192: "rc"}.get(kind & 0xC0 if kind < 255 else 255, "")
     return f"{major}.{minor}.{patch}{' ' + word if word else ''}"
+
+
+def _is_number(value: object) -> bool:
+    """Whether the value of a parameter can be used; in a damaged file it can be anything."""
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _times(count: int) -> str:
