@@ -112,7 +112,7 @@ def load_ulog(path: Path) -> Log:
     try:
         # pyulog prints what it meets in a damaged file; we tell it ourselves.
         with contextlib.redirect_stdout(io.StringIO()):
-            log = ULog(str(path), message_name_filter_list=list(TOPICS))
+            log = ULog(_Stream(io.FileIO(path)), message_name_filter_list=list(TOPICS))
     except OSError as error:
         raise InputError(f"{path}: cannot read the log ({error.strerror or error}); check the path") from None
     except Exception as error:  # noqa: BLE001 - pyulog lets through whatever its parser meets
@@ -137,6 +137,27 @@ def load_ulog(path: Path) -> Log:
         str(log.msg_info_dict.get("ver_hw", "")),
         tuple(notes),
     )
+
+
+class _Stream(io.BufferedReader):
+    """A file in which a step back after a read that met the end is as long as what was read.
+
+    pyulog (1.3) steps back by what it asked for. In a damaged file that is cut as well it then never ends.
+    """
+
+    missing = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Bytes from here on; how many of those asked for were missing is remembered."""
+        data = super().read(size)
+        self.missing = max(0, (size or 0) - len(data))
+        return data
+
+    def seek(self, target: int, whence: int = 0, /) -> int:
+        """Go to a position; backwards from here no further than was read."""
+        if whence == io.SEEK_CUR and target < 0:
+            target, self.missing = min(0, target + self.missing), 0
+        return super().seek(target, whence)
 
 
 def collect(parts: Iterable[tuple[str, int, dict[str, Any]]]) -> dict[str, tuple[Topic, ...]]:

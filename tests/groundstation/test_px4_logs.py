@@ -345,6 +345,16 @@ def test_a_damaged_log_is_read_or_told_never_more(seed, tmp_path):
         assert flight.duration < 60.0 and np.all(np.diff(flight.t) > 0)
 
 
+def test_a_cut_log_whose_definitions_are_damaged_comes_to_an_end(tmp_path):
+    content = log_of("1.15").save(tmp_path / "whole.ulg").read_bytes()
+    path = tmp_path / "damaged.ulg"
+    # The length of the second definition says more than the file has.
+    second = 16 + 43
+    path.write_bytes(content[:second] + b"\xff\xff\x00" + content[second + 3 : 20_000])
+    with pytest.raises(InputError):
+        read_flight(path, VEHICLE)
+
+
 def test_one_wrong_time_costs_one_sample(tmp_path):
     log = log_of("1.15")
     whole = load_ulog(log.save(tmp_path / "whole.ulg")).topic("vehicle_attitude")
