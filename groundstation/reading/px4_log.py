@@ -65,7 +65,8 @@ class Topic:
 
     def stack(self, *names: str) -> np.ndarray:
         """Fields as columns (M, k)."""
-        return np.stack([np.asarray(self.fields[name], dtype=float) for name in names], -1)
+        with np.errstate(invalid="ignore"):  # a damaged file holds what is no number
+            return np.stack([np.asarray(self.fields[name], dtype=float) for name in names], -1)
 
     def has(self, *names: str) -> bool:
         """Whether the topic has all of these fields."""

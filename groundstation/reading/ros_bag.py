@@ -259,19 +259,24 @@ def _odometry(one: _Recorded, columns: Fields) -> list[tuple[str, Fields]]:
         return made
     position, velocity = _vectors(columns, "pose.pose.position"), _vectors(columns, "twist.twist.linear")
     attitude = _attitude(columns, "pose.pose.orientation")
-    stamp = 1e-6 * _stamp(one)
-    step = np.diff(stamp)
-    good = step > 1e-4
-    moved = np.diff(position, axis=0)[good] / step[good][:, None]
     turned = rotate(attitude, velocity) if attitude is not None else velocity
     # The twist is the child's frame by its definition; many senders fill in the world's.
-    as_body, as_world = (
-        float(np.median(np.linalg.norm(v[1:][good] - moved, axis=1))) for v in (turned, velocity)
-    )
-    velocity = velocity if as_world < 0.5 * as_body else turned
+    stamp = 1e-6 * _stamp(one)
+    if _off(stamp, position, velocity) > 0.8 * _off(stamp, position, turned):
+        velocity = turned
     world = velocity if _is_ned(one) else enu_from_ned(velocity)
     made[0][1].update(dict(zip(("vx", "vy", "vz"), world.T, strict=True)))
     return made
+
+
+def _off(t: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float:
+    """How far (m, median) half a second of velocities (M, 3) leads away from the positions (M, 3) there."""
+    way = np.zeros_like(position)
+    way[1:] = np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t)[:, None], axis=0)
+    later = np.searchsorted(t, t + 0.5)
+    rows = np.flatnonzero(later < len(t))
+    moved, led = position[later[rows]] - position[rows], way[later[rows]] - way[rows]
+    return float(np.median(np.linalg.norm(moved - led, axis=1))) if len(rows) else 0.0
 
 
 def _stamped_pose(one: _Recorded, columns: Fields) -> list[tuple[str, Fields]]:
