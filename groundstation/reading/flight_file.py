@@ -11,7 +11,7 @@ import numpy as np
 from groundstation.reading import plausible
 from groundstation.reading.airborne import flying_mask
 from groundstation.reading.table import Table, own_columns, read_table, unknown_columns
-from groundstation.reading.uniform import even_clock
+from groundstation.reading.uniform import MOST_LOST, even_clock
 from models.errors import InputError
 from models.flight import Flight
 from models.vehicle import Vehicle, load_vehicle
@@ -89,33 +89,43 @@ def assemble(
     flying: np.ndarray | None = None,
     commanded: np.ndarray | None = None,
     notes: tuple[str, ...] = (),
+    most_lost: float = MOST_LOST,
 ) -> Flight:
     """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
-    find what was flown. `place(row)` names a row in messages. Raises `InputError` for anything that cannot be
-    analysed."""
+    find what was flown. `place(row)` names a row in messages; `most_lost` is the share of samples that gaps may
+    take. Raises `InputError` for anything that cannot be analysed."""
     origin = str(path)
     _check_groups(origin, columns)
-    plausible.check_clock(t, place)
     said = list(notes)
     names = list(columns)
-    every = {**columns, **{f"extra {k}": v for k, v in (extra or {}).items()}}
+    every = {
+        **plausible.without_empty_attitude(columns),
+        **{f"extra {k}": v for k, v in (extra or {}).items()},
+    }
     if flying is not None:
         every["flying"] = np.asarray(flying, dtype=bool)
     if commanded is not None:
         every["commanded"] = np.asarray(commanded, dtype=bool)
+    t, every, order, more = plausible.in_order(t, every)
+    said += more
+
+    def sorted_place(row: int) -> str:
+        return place(int(order[min(row, len(order) - 1)]) if len(order) else 0)
+
+    plausible.check_clock(t, sorted_place)
     t, every, more = plausible.without_duplicates(t, every)
     said += more
     given = {name: every[name] for name in names}
     others = {name: column for name, column in every.items() if name not in given}
     index = np.arange(len(t))
-    _, given_and_index, more = plausible.complete(t, {**given, "row": index}, place)
+    _, given_and_index, more = plausible.complete(t, {**given, "row": index}, sorted_place)
     kept = given_and_index.pop("row")
     t, given = t[kept], given_and_index
     others = {name: column[kept] for name, column in others.items()}
     said += more
     plausible.check_units(given, vehicle, origin)
     given = plausible.continuous(given)
-    t, every, more = even_clock(t, {**given, **others}, origin)
+    t, every, more = even_clock(t, {**given, **others}, origin, most_lost)
     said += more
     given = {name: every[name] for name in given}
     if "thrust_command" not in given:

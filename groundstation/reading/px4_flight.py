@@ -108,6 +108,7 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle) -> Flight:
         lambda row: f"{path}, t = {clock[min(row, len(clock) - 1)] - start:.2f} s",
         commanded=(air.in_air & usable)[recorded],
         notes=tuple(notes),
+        most_lost=1.0,  # what was not recorded is told, and what is left is whole
     )
 
 

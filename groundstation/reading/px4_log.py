@@ -41,6 +41,18 @@ TOPICS = (
     "vehicle_thrust_setpoint",
 )
 DAY = 86_400_000_000  # us
+SANE = {
+    "vehicle_thrust_setpoint": 2.0,
+    "vehicle_rates_setpoint": 200.0,
+    "vehicle_attitude_setpoint": 200.0,
+    "actuator_controls_0": 2.0,
+    "actuator_motors": 2.0,
+    "vehicle_angular_velocity": 200.0,
+    "sensor_combined": 2000.0,
+    "vehicle_acceleration": 2000.0,
+}
+"""Magnitudes that no sample of a topic reaches (normalised, rad/s, m/s²): more is damage, not flight."""
+MEASURED = ("xyz", "control", "thrust_body", "roll", "pitch", "yaw", "gyro_rad", "accelerometer_m_s2")
 
 
 @dataclass(frozen=True)
@@ -192,6 +204,12 @@ def _topic(name: str, instance: int, fields: dict[str, np.ndarray]) -> Topic | N
     if np.all(sample > 0) and np.max(np.abs(stamp - sample), initial=0) < 1_000_000:
         stamp = sample
     rows = _in_order(stamp)
+    if name in SANE:
+        with np.errstate(invalid="ignore"):
+            wild = [
+                np.abs(v[rows]) > SANE[name] for key, v in fields.items() if key.split("[")[0] in MEASURED
+            ]
+        rows = rows[~np.any(wild, axis=0)] if wild else rows
     if len(rows) < 2:
         return None
     return Topic(name, stamp[rows] * 1e-6, {key: values[rows] for key, values in fields.items()}, instance)
