@@ -20,7 +20,9 @@ LOWEST_RATE = 10.0  # Hz; below it neither rates nor drag can be told from noise
 SHORTEST = 2.0  # s
 MOST_MISSING = 0.02
 SHUFFLED = 0.02
-"""Share of too short steps above which sorted rows are not one flight."""
+"""Share of repeated times above which sorted rows are not one flight."""
+LONG = 50
+"""Rows in a stretch, and rows that come too late after it, from which on a logger began again."""
 BETWEEN = 0.06
 """s; values known this often or more are interpolated in rows between them."""
 HELD = (
@@ -73,16 +75,16 @@ def check_clock(t: np.ndarray, place: Callable[[int], str]) -> None:
 def in_order(
     t: np.ndarray, columns: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray, list[str]]:
-    """Rows sorted by time, the order they came in (N,), and a note: only where sorting makes one even clock, so that
-    rows were shuffled. Where a logger started again two stretches would interleave; those stay for `check_clock` to
-    refuse."""
+    """Rows sorted by time, the order they came in (N,), and a note: only where single rows were out of order, or all
+    were shuffled. Where a logger started again two stretches would interleave; `check_clock` refuses those."""
     order = np.argsort(t, kind="stable")
     back = int(np.sum(np.diff(t) < 0)) if np.all(np.isfinite(t)) else 0
     if not back:
         return t, columns, np.arange(len(t)), []
-    steps = np.diff(t[order])
-    usual = float(np.median(steps))
-    if usual <= 0 or np.mean(steps < 0.5 * usual) > SHUFFLED:
+    late = int(np.sum(t < np.maximum.accumulate(t)))
+    began_again = len(t) / (back + 1) >= LONG and late >= LONG * back
+    repeated = np.mean(np.diff(t[order]) <= 0) > SHUFFLED
+    if began_again or repeated:
         return t, columns, np.arange(len(t)), []
     note = f"the rows were not in order of time ({back} steps back) and were sorted"
     return t[order], {name: column[order] for name, column in columns.items()}, order, [note]
