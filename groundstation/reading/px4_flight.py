@@ -87,6 +87,11 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle) -> Flight:
     columns |= inertial
     lost += sources
     notes += said
+    if "specific_force" not in columns and not {"position", "velocity"} & set(columns):
+        raise InputError(
+            f"{log.origin}: neither an accelerometer of {FAST:.0f} Hz (sensor_combined) nor a valid estimate of the "
+            f"velocity is in the log: nothing was measured that thrust could be compared with; {log.advice}"
+        )
     commands, said = _commands(log, air, vehicle)
     columns |= commands
     notes += said
