@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from contextlib import nullcontext
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,12 +19,14 @@ from models.errors import InputError
 if TYPE_CHECKING:
     from groundstation.linear_design import Loop
     from groundstation.tracking import Tracking
+    from groundstation.vehicle_draft import Draft
     from models.flight import Flight
-    from models.vehicle import Vehicle
 
 console = Console()
 
-FlightFile = Annotated[Path, typer.Argument(help="A flight: CSV, Parquet, MCAP record or PX4 ULog.")]
+FlightFile = Annotated[
+    Path, typer.Argument(help="A flight: CSV, Parquet, PX4 ULog, MCAP of the companion or ROS 2.")
+]
 VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
 ]
@@ -187,80 +190,83 @@ def import_command(
         raise InputError(f"{output}: that is the file itself; choose another -o, the original stays as it is")
     if mass is not None and draft is None:
         raise InputError("--mass goes with --draft-vehicle; a vehicle file of your own tells its mass itself")
-    drafted: dict[str, Any] = {}
-    believed: Path | Vehicle | None = vehicle
-    if draft is not None:
-        if vehicle is not None:
-            raise InputError(
-                "--draft-vehicle: leave out --vehicle, the draft is what the log tells without it"
-            )
-        believed, drafted = _draft(file, draft, mass, as_json)
-    if output is None:
-        if as_json:
-            typer.echo(json.dumps(drafted, indent=1))
-        return
-    flight = read_flight(file, believed, mapping)
-    vehicle_path = write_flight(flight, output)
+    if draft is not None and vehicle is not None:
+        raise InputError("--draft-vehicle: leave out --vehicle, the draft is what the log tells without it")
+    if (
+        output is not None
+        and draft is not None
+        and output.with_suffix(".vehicle.toml").resolve() == draft.resolve()
+    ):
+        raise InputError(f"{draft}: -o writes the vehicle as it was read there; name the draft otherwise")
+    told: dict[str, Any] = {}
+    with nullcontext() if as_json else console.status(f"reading {escape(file.name)}"):
+        drafted = None if draft is None else _drafted(file, draft, mass)
+        flight = None
+        if output is not None:
+            flight = read_flight(file, vehicle if drafted is None else drafted.vehicle, mapping)
+            vehicle_path = write_flight(flight, output)
+            told = {
+                "flight": str(output),
+                "vehicle": str(vehicle_path),
+                "samples": len(flight),
+                "duration": round(flight.duration, 3),
+                "columns": list(own_table(flight)),
+                "notes": list(flight.notes),
+            }
+    if drafted is not None and draft is not None:
+        from groundstation.vehicle_draft import write_draft
+
+        write_draft(drafted, draft)
+        told |= {
+            "vehicle_draft": str(draft),
+            "values": tomllib.loads(drafted.text),
+            "sources": {line.key: line.source for line in drafted.lines},
+            "to_complete": list(drafted.to_complete),
+        }
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    **drafted,
-                    "flight": str(output),
-                    "vehicle": str(vehicle_path),
-                    "samples": len(flight),
-                    "duration": round(flight.duration, 3),
-                    "columns": list(own_table(flight)),
-                    "notes": list(flight.notes),
-                },
-                indent=1,
-            )
-        )
+        typer.echo(json.dumps(told, indent=1))
         return
-    console.print(
-        f"{escape(str(output))}: {len(flight)} samples, {flight.duration:.1f} s at {1 / flight.dt:.0f} Hz"
-    )
-    console.print(f"{escape(str(vehicle_path))}: the vehicle as it was believed to be")
-    _print_notes(flight)
+    if drafted is not None and draft is not None:
+        _print_draft(drafted, draft, file)
+    if flight is not None:
+        console.print(
+            f"{escape(str(output))}: {len(flight)} samples, {flight.duration:.1f} s at {1 / flight.dt:.0f} Hz"
+        )
+        console.print(f"{escape(str(vehicle_path))}: the vehicle as it was believed to be")
+        _print_notes(flight)
 
 
-def _draft(file: Path, target: Path, mass: float | None, quiet: bool) -> tuple[Vehicle, dict[str, Any]]:
-    """Draft the vehicle file of a PX4 log; what it says, for a program."""
-    from rich.table import Table
-
+def _drafted(file: Path, target: Path, mass: float | None) -> Draft:
+    """The vehicle file drafted from a PX4 log, not yet written."""
     from groundstation.reading.flight_file import ULOGS
     from groundstation.reading.px4_log import load_ulog
-    from groundstation.vehicle_draft import draft_vehicle, write_draft
+    from groundstation.vehicle_draft import draft_vehicle
 
     if file.suffix.lower() not in ULOGS:
         raise InputError(f"{file}: only a PX4 ULog holds the parameters that a vehicle file is drafted from")
     if target.exists():
         raise InputError(f"{target}: there is a file already; a draft never replaces one, name another")
-    drafted = draft_vehicle(load_ulog(file), mass)
-    write_draft(drafted, target)
-    if not quiet:
-        table = Table(title=f"{escape(str(target))}: drafted from {escape(file.name)}", title_justify="left")
-        table.add_column("value", overflow="fold")
-        table.add_column("where it is from", overflow="fold")
-        for line in drafted.lines:
-            if line.key == "rotor_directions" and not line.stated:
-                continue
-            mark = "" if line.complete else "[yellow]TO COMPLETE[/yellow] "
-            value = f"{line.key} = {line.value}" if line.stated else f"{line.key} (left out)"
-            table.add_row(escape(value), mark + escape(line.source))
-        console.print(table)
-        console.print(
-            f"[yellow]the log cannot tell {escape(', '.join(drafted.to_complete))}[/yellow]: correct them in "
-            f"{escape(str(target))}",
-            highlight=False,
-        )
-    values = tomllib.loads(drafted.text)
-    return drafted.vehicle, {
-        "vehicle_draft": str(target),
-        "values": values,
-        "sources": {line.key: line.source for line in drafted.lines},
-        "to_complete": list(drafted.to_complete),
-    }
+    return draft_vehicle(load_ulog(file), mass)
+
+
+def _print_draft(drafted: Draft, target: Path, file: Path) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"{escape(str(target))}: drafted from {escape(file.name)}", title_justify="left")
+    table.add_column("value", overflow="fold")
+    table.add_column("where it is from", overflow="fold")
+    for line in drafted.lines:
+        if line.key == "rotor_directions" and not line.stated:
+            continue
+        mark = "" if line.complete else "[yellow]TO COMPLETE[/yellow] "
+        value = f"{line.key} = {line.value}" if line.stated else f"{line.key} (left out)"
+        table.add_row(escape(value), mark + escape(line.source))
+    console.print(table)
+    console.print(
+        f"[yellow]the log cannot tell {escape(', '.join(drafted.to_complete))}[/yellow]: correct them in "
+        f"{escape(str(target))}",
+        highlight=False,
+    )
 
 
 def design_command(

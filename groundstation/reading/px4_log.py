@@ -25,6 +25,9 @@ TOPICS = (
     "actuator_outputs",
     "battery_status",
     "esc_status",
+    "estimator_attitude",
+    "estimator_local_position",
+    "estimator_selector_status",
     "hover_thrust_estimate",
     "sensor_combined",
     "trajectory_setpoint",
@@ -139,9 +142,11 @@ def load_ulog(path: Path) -> Log:
     if log.file_corruption:
         notes.append("parts of the log are damaged and were skipped")
     release = log.get_version_info()
+    topics, said = _selected(collect((d.name, int(d.multi_id), dict(d.data)) for d in log.data_list))
+    notes += said
     return Log(
         str(path),
-        collect((d.name, int(d.multi_id), dict(d.data)) for d in log.data_list),
+        topics,
         {name: float(value) for name, value in log.initial_parameters.items() if _is_number(value)},
         tuple(
             (1e-6 * t, name, float(value)) for t, name, value in log.changed_parameters if _is_number(value)
@@ -195,6 +200,26 @@ def collect(parts: Iterable[tuple[str, int, dict[str, Any]]]) -> dict[str, tuple
         if topic is not None:
             topics.setdefault(name, []).append(topic)
     return {name: tuple(instances) for name, instances in topics.items()}
+
+
+def _selected(topics: dict[str, tuple[Topic, ...]]) -> tuple[dict[str, tuple[Topic, ...]], list[str]]:
+    """Of several estimators the one that PX4 flew by, where its own choice (`vehicle_*`) was not logged."""
+    notes: list[str] = []
+    selector = topics.get("estimator_selector_status", ())
+    primary = 0
+    if selector and selector[0].has("primary_instance"):
+        primary = int(np.median(selector[0].fields["primary_instance"]))
+    for wanted, estimated in (
+        ("vehicle_attitude", "estimator_attitude"),
+        ("vehicle_local_position", "estimator_local_position"),
+    ):
+        instances = topics.get(estimated, ())
+        if wanted in topics or not instances:
+            continue
+        chosen = next((topic for topic in instances if topic.instance == primary), instances[0])
+        topics = {**topics, wanted: (Topic(wanted, chosen.t, chosen.fields),)}
+        notes.append(f"{wanted} is that of {estimated} {chosen.instance}, the estimator in use")
+    return topics, notes
 
 
 def _topic(name: str, instance: int, fields: dict[str, np.ndarray]) -> Topic | None:

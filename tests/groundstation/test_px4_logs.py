@@ -197,6 +197,29 @@ def test_odometry_stands_in_for_the_local_position(release, body, tmp_path):
     assert np.sqrt(np.mean((flight.velocity[rows] - flown().velocity[same]) ** 2)) < 0.02
 
 
+def test_of_several_estimators_the_one_in_use_is_read(tmp_path):
+    log = log_of("1.16")
+    for name, estimate in (
+        ("vehicle_attitude", "estimator_attitude"),
+        ("vehicle_local_position", "estimator_local_position"),
+    ):
+        index = next(i for i, topic in enumerate(log.topics) if topic[0] == name)
+        _, _, t, fields = log.topics.pop(index)
+        wrong = {key: (code, np.zeros_like(values)) for key, (code, values) in fields.items()}
+        wrong["timestamp_sample"] = fields["timestamp_sample"]
+        log.add(estimate, t, 0, **wrong)
+        log.add(estimate, t, 1, **fields)
+    log.add(
+        "estimator_selector_status",
+        flown().t[::100],
+        primary_instance=("B", np.ones(len(flown().t[::100]), int)),
+    )
+    flight = read(log, tmp_path)
+    rows, same = middle_of(flight, flown())
+    assert np.sqrt(np.mean((flight.position[rows] - flown().position[same]) ** 2)) < 0.01
+    assert any("estimator_local_position 1" in note for note in flight.notes)
+
+
 def test_what_the_logger_dropped_is_a_gap_and_not_made_up(tmp_path):
     log = log_of("1.15")
     hole = (BOOT + 10.0, BOOT + 11.0)

@@ -108,12 +108,19 @@ def test_import_drafts_reads_and_says_what_is_missing(tmp_path):
         ((), "-o FILE.csv"),
         (("--mass", "1", "-o", "x.csv"), "--draft-vehicle"),
         (("--draft-vehicle", "v.toml", "--vehicle", "w.toml"), "leave out --vehicle"),
+        (("--draft-vehicle", "f.vehicle.toml", "-o", "f.csv"), "name the draft otherwise"),
     ],
 )
 def test_import_says_what_goes_together(arguments, said, tmp_path):
     log = log_of("1.15").save(tmp_path / "log.ulg")
     done = groundstation("import", log, *arguments)
     assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_where_the_flight_cannot_be_written_there_is_no_draft_either(tmp_path):
+    log = log_of("1.15").save(tmp_path / "log.ulg")
+    done = groundstation("import", log, "--draft-vehicle", tmp_path / "v.toml", "-o", tmp_path / "flight.txt")
+    assert done.returncode == 2 and not (tmp_path / "v.toml").exists()
 
 
 def test_a_csv_has_no_parameters_to_draft_from(tmp_path):
