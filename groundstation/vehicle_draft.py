@@ -223,8 +223,8 @@ def _thrust(log: Log, air: Airborne | None) -> tuple[Line, ...]:
         "thrust_model", '"linear"', "",
         "what PX4 assumes of this command"
         + (f", with THR_MDL_FAC {factor:g}" if factor else
-           f"; {'the log holds no THR_MDL_FAC' if factor is None else 'THR_MDL_FAC is 0'}, real propellers are nearer to "
-           '"quadratic": the effect thrust_curve tells'),
+           f"; {'the log holds no THR_MDL_FAC' if factor is None else 'THR_MDL_FAC is 0'}, real propellers are nearer "
+           'to "quadratic": the effect thrust_curve tells'),
     )  # fmt: skip
     voltage = None
     if air is not None and (battery := battery_in_use(log, air)) is not None:

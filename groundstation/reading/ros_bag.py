@@ -13,12 +13,12 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, Header, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 
 from groundstation.reading.px4_log import TOPICS, Log, collect
 from groundstation.reading.uniform import continuous_quaternion
@@ -52,7 +52,9 @@ def is_ros_bag(path: Path) -> bool:
     """Whether an MCAP file holds ROS 2 messages."""
     try:
         with path.open("rb") as stream:
-            for record in StreamReader(stream, record_size_limit=1 << 28).records:
+            for record in _records(stream, []):
+                if isinstance(record, Header) and record.profile == "ros2":
+                    return True
                 if isinstance(record, Channel):
                     return record.message_encoding == "cdr"
     except (OSError, McapError, EndOfFile, struct.error, ValueError):
@@ -88,8 +90,9 @@ def load_ros_bag(path: Path) -> Log:
             notes.append(f"{', '.join(sorted({part[0] for part in new}))} from {source}")
     topics = collect(parts)
     if not topics:
+        has = "; ".join([seen or "no messages", *notes[:1]])
         raise InputError(
-            f"{path}: none of the topics of a PX4 flight is in the recording (it has {seen or 'no messages'}); {ADVICE}"
+            f"{path}: none of the topics of a PX4 flight is in the recording (it has {has}); {ADVICE}"
         )
     return Log(
         str(path), topics, hardware="", notes=tuple(notes), faster="record the topic faster", advice=ADVICE
@@ -105,10 +108,11 @@ def _read(path: Path) -> tuple[list[_Recorded], str, list[str]]:
     channels: dict[int, tuple[_Recorded, Callable[[bytes], Any]]] = {}
     seen: dict[str, str] = {}
     unreadable: list[str] = []
+    damaged: list[str] = []
     cut = ""
     try:
         with path.open("rb") as stream:
-            for record in StreamReader(stream, record_size_limit=1 << 28).records:
+            for record in _records(stream, damaged):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
@@ -129,14 +133,30 @@ def _read(path: Path) -> tuple[list[_Recorded], str, list[str]]:
         raise InputError(f"{path}: cannot read the recording ({error.strerror}); check the path") from None
     except EndOfFile:
         cut = "it is cut off"
-    except Exception as error:  # noqa: BLE001 - each decompressor and decoder raises its own kind
+    except Exception as error:  # noqa: BLE001 - each decoder raises its own kind
         cut = f"it is damaged ({str(error) or type(error).__name__})"
     notes = [f"the recording is not whole: {cut}; what came before was read"] if cut else []
+    if damaged:
+        notes.append(f"{len(damaged)} damaged parts of the recording were skipped")
     if unreadable:
         notes.append(f"no readable definition of {', '.join(unreadable[:4])} in the recording; {ADVICE}")
     kept = [one for one, _ in channels.values() if len(one.rows) > 1]
     shown = ", ".join(sorted(seen)[:8]) + (" ..." if len(seen) > 8 else "")
     return kept, shown, notes
+
+
+def _records(stream: BinaryIO, damaged: list[str]) -> Iterator[Any]:
+    """Every record that is whole; a chunk that is not is skipped and noted in `damaged`."""
+    for record in StreamReader(stream, emit_chunks=True, record_size_limit=1 << 28).records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        try:
+            parts = breakup_chunk(record, validate_crc=True)
+        except Exception as error:  # noqa: BLE001 - each decompressor raises its own kind
+            damaged.append(str(error))
+            continue
+        yield from parts
 
 
 def _usable(topic: str, kind: str) -> bool:

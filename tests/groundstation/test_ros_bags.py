@@ -79,14 +79,14 @@ class Bag:
     """A recording that is being written; messages go in by time."""
 
     def __init__(self, path):
-        self.path, self.pending = path, []
+        self.path, self.pending, self.chunk = path, [], 1 << 20
 
     def put(self, t, topic, kind, definition, message, stamp=None):
         self.pending.append((t, topic, kind, definition, message))
 
     def save(self):
         with self.path.open("wb") as stream:
-            writer = Writer(stream)
+            writer = Writer(stream, chunk_size=self.chunk)
             schemas = {}
             for t, topic, kind, definition, message in sorted(self.pending, key=lambda entry: entry[0]):
                 if kind not in schemas:
@@ -224,16 +224,20 @@ def test_of_two_vehicles_one_is_read(tmp_path):
     assert any("2 vehicles" in note and "/px4_1" in note for note in flight.notes)
 
 
-def test_a_recording_cut_off_keeps_what_was_written(tmp_path):
-    content = px4_topics(Bag(tmp_path / "bag.mcap"), log_of("1.16")).save().read_bytes()
+def test_a_recording_cut_off_or_damaged_keeps_what_is_whole(tmp_path):
+    bag = px4_topics(Bag(tmp_path / "bag.mcap"), log_of("1.16"))
+    bag.chunk = 20_000
+    content = bag.save().read_bytes()
     path = tmp_path / "cut.mcap"
-    path.write_bytes(content[: int(0.8 * len(content))])
-    try:
-        flight = read_flight(path, VEHICLE)
-    except InputError as error:  # everything may be in one chunk that is not whole
-        assert "\n" not in str(error)
-    else:
-        assert any("not whole" in note for note in flight.notes)
+    path.write_bytes(content[: int(0.7 * len(content))])
+    flight = read_flight(path, VEHICLE)
+    assert any("not whole" in note for note in flight.notes) and flight.duration > 10.0
+    path.write_bytes(content[: len(content) // 2] + bytes(200) + content[len(content) // 2 + 200 :])
+    flight = read_flight(path, VEHICLE)
+    assert any("damaged parts" in note for note in flight.notes)
+    path.write_bytes(content[:3000])
+    with pytest.raises(InputError, match="PX4 flight"):
+        read_flight(path, VEHICLE)
 
 
 def test_a_recording_of_something_else_says_what_it_has(tmp_path):
