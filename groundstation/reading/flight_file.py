@@ -190,7 +190,7 @@ def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:
     if (beside := _beside(path, "vehicle.toml")) is not None:
         return load_vehicle(beside)
     draft = (
-        f"; `groundstation import {path} --draft-vehicle vehicle.toml` drafts one from the log"
+        f"; `groundstation import {path} --draft-vehicle {path.with_name('vehicle.toml')}` drafts one"
         if path.suffix.lower() in ULOGS
         else ""
     )
