@@ -546,6 +546,7 @@ class _Search:
         m = whole.problem.measurements[0]
         axes = list(m.axes)
         shift = [float(here.fit.estimate[i]) for i, f in enumerate(here.fit.free) if f.nuisance]
+        left = float(np.sqrt(here.fit.sse / whole.samples))
         final = model_of(here.fit, self.base)
         final = final.with_terms((*final.terms, *rate_terms))
         return Diagnosis(
@@ -553,8 +554,9 @@ class _Search:
             base=self.base,
             model=final,
             rms_before=float(np.sqrt(all_before)),
-            rms_after=float(np.sqrt(here.fit.sse / whole.samples)),
-            noise_floor=float(np.sqrt(np.mean(m.noise[axes] ** 2))),
+            rms_after=left,
+            # noise cannot leave more than what is left: a vibration is stronger beyond the pass band than in it
+            noise_floor=min(float(np.sqrt(np.mean(m.noise[axes] ** 2))), left),
             bandwidth=m.bandwidth,
             axes=m.axes,
             validation_before=None if self.held_out is None else float(np.sqrt(whole._before(held_out=True))),
