@@ -41,6 +41,10 @@ def calibrate_command(
         float,
         typer.Option(help="Usual length of a flight; a quarter is half, a quarter one and a half of it."),
     ] = 90.0,
+    strength: Annotated[
+        float,
+        typer.Option(help="Factor on the sizes of what is hidden: 0.3 for weak effects.", min=0.01, max=3),
+    ] = 1.0,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for all it makes; the same one goes on.")
     ] = Path("calibration"),
@@ -75,7 +79,7 @@ def calibrate_command(
         raise InputError(
             f"{believed}: no design to fly by; make one: groundstation design {vehicle}, or pass --design"
         )
-    study = Study(output, vehicle, believed, seed, seconds, hideable())
+    study = Study(output, vehicle, believed, seed, seconds, hideable(), strength)
     wanted = sorties(study, flights)
     study.open()
     if again:
@@ -89,7 +93,13 @@ def calibrate_command(
         cases = run(study, wanted, jobs or len(os.sched_getaffinity(0)), done)
     result = calibrate(cases)
     table = calibration_table(result, cases)
-    table = {"vehicle": cases[0].vehicle, "seed": seed, "seconds_usual": seconds, **table}
+    table = {
+        "vehicle": cases[0].vehicle,
+        "seed": seed,
+        "seconds_usual": seconds,
+        "strength": strength,
+        **table,
+    }
     page = write_calibration(output, table)
     if as_json:
         print_json({**table, "report": str(page)})

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -62,8 +62,8 @@ EVENTS = ("payload", "estimator_delay")
 
 @dataclass(frozen=True)
 class Sortie:
-    """One flight of a study, before it is flown: `number` from 1, `seed` of the simulator, `rotor_speeds` whether the
-    diagnosis may see them."""
+    """One flight of a study, before it is flown: `number` from 1, `seed` of the simulator, `rotor_speeds` whether its
+    record has them."""
 
     number: int
     seed: int
@@ -84,7 +84,7 @@ class Sortie:
 @dataclass(frozen=True)
 class Study:
     """A folder of flights: the files of vehicle and design, `seed` of all draws, `seconds` of a flight of usual length,
-    `names` of the effects that may be hidden."""
+    `names` of the effects that may be hidden, `strength` the factor on their sizes."""
 
     folder: Path
     vehicle: Path
@@ -92,6 +92,7 @@ class Study:
     seed: int
     seconds: float
     names: tuple[str, ...]
+    strength: float = 1.0
 
     def settings(self) -> dict[str, Any]:
         """All that the flights depend on, but their number."""
@@ -99,6 +100,7 @@ class Study:
             "seed": self.seed,
             "seconds": self.seconds,
             "effects": list(self.names),
+            "strength": self.strength,
             "vehicle": self.vehicle.read_text(encoding="utf-8"),
             "design": self.design.read_text(encoding="utf-8"),
         }
@@ -288,8 +290,19 @@ def command_of(study: Study, sortie: Sortie) -> list[str]:
     words += ["--vehicle", study.vehicle, "--design", study.design]
     for name in sortie.hidden or ("none",):
         words += ["--hidden", name]
-    words += ["--seed", sortie.seed, "--noise", sortie.noise, "--charge", sortie.charge]
-    words += ["--controller", sortie.controller, "-o", f"{stem}.mcap", "--sealed", f"{stem}.sealed", "--json"]
+    words += [
+        "--strength",
+        study.strength,
+        "--seed",
+        sortie.seed,
+        "--noise",
+        sortie.noise,
+        "--charge",
+        sortie.charge,
+    ]
+    words += ["--controller", sortie.controller]
+    words += ["--rotor-speeds" if sortie.rotor_speeds else "--no-rotor-speeds"]
+    words += ["-o", f"{stem}.mcap", "--sealed", f"{stem}.sealed", "--json"]
     return [str(word) for word in words]
 
 
@@ -333,8 +346,6 @@ def diagnose_record(study: Study, sortie: Sortie) -> dict[str, Any]:
     begin = time.perf_counter()
     try:
         flight = read_flight((study.folder / sortie.name).with_suffix(".mcap"))
-        if not sortie.rotor_speeds:
-            flight = replace(flight, rotor_speed=None, motor_command=None)
         told = diagnosis_table(diagnose(flight, rigid_body_model(flight.vehicle)))
     except Exception as error:  # noqa: BLE001 - one flight that ends in an error is a finding, not the end
         told = {"error": f"{type(error).__name__}: {error}"}
