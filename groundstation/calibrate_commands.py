@@ -68,9 +68,9 @@ def calibrate_command(
     from groundstation.calibration_study import Study, forget_diagnoses, hideable, run, sorties
     from groundstation.report.calibration import write_calibration
 
-    if not 20.0 <= seconds <= 1800.0:
+    if not 40.0 <= seconds <= 1800.0:
         raise InputError(
-            f"--seconds {seconds:g}: must be 20 to 1800, shorter flights cannot be held out in blocks"
+            f"--seconds {seconds:g}: must be 40 to 1800, shorter flights cannot be held out in blocks"
         )
     if not vehicle.is_file():
         raise InputError(f"{vehicle}: no such vehicle file")
@@ -178,15 +178,15 @@ def print_calibration(result: Calibration, folder: Path) -> None:
     table.add_column("parameter", no_wrap=True)
     for heading in ("intervals", "hold it", "95 % need them\nwider by", "error,\nmedian"):
         table.add_column(heading, justify="right")
-    for row in result.coverage:
-        if row.parameter:
+    for held in result.coverage:
+        if held.parameter:
             continue
         table.add_row(
-            row.effect or "[bold]all[/bold]",
-            str(row.inside.of),
-            _share(row.inside),
-            f"{row.widen:.2f}",
-            f"{100 * row.error:.1f} %",
+            held.effect or "[bold]all[/bold]",
+            str(held.inside.of),
+            _share(held.inside),
+            f"{held.widen:.2f}",
+            f"{100 * held.error:.1f} %",
         )
     console.print(table)
 

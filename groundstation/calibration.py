@@ -271,6 +271,8 @@ class Calibration:
     """Flights of all kinds in which an effect that is not there is called missing."""
     confusion: tuple[Row, ...]
     coverage: tuple[Coverage, ...]
+    claims: int
+    """Verdicts that say that an effect is, or is not, there."""
     present: Reliability
     absent: Reliability
     wrong: tuple[Wrong, ...]
@@ -296,6 +298,7 @@ def calibrate(cases: Sequence[Case]) -> Calibration:
         false_effects=proportion(bool(c.false(MISSING)) for c in good),
         confusion=confusion(good),
         coverage=coverage(good),
+        claims=len(claims),
         present=reliability([c for c in claims if c.present]),
         absent=reliability([c for c in claims if not c.present]),
         wrong=tuple(wrong for c in cases for wrong in wrongs(c)),
@@ -342,7 +345,11 @@ def _count(names: Iterable[str]) -> dict[str, int]:
 
 
 def coverage(cases: Sequence[Case]) -> tuple[Coverage, ...]:
-    """Coverage of all intervals of effects that were rightly named (first), then by effect and by parameter."""
+    """Coverage of all intervals of effects that were rightly named (first), then by effect and by parameter.
+
+    Only flights in which all that is hidden was named: what is left out of a model bends the parameters of the rest.
+    """
+    cases = [c for c in cases if all(c.outcome(n) in (MISSING, POSSIBLE) for n in c.truth)]
     found = [(s.name, e, s.error) for c in cases for s in c.named() if s.name in c.truth for e in s.estimates]
     known = [(name, e, error) for name, e, error in found if e.truth is not None]
     rows = [_covered("", "", known)] if known else []

@@ -166,7 +166,9 @@ def sorties(study: Study, count: int) -> tuple[Sortie, ...]:
             tens = [n for n, share in SHARES.items() for _ in range(round(10 * share))]
             generator.shuffle(tens)
         hidden = deal(min(tens.pop(), len(names)))
-        found.append(_sortie(generator, number, hidden, study.seconds, integral))
+        # in the simulator's order, for there a later effect may act on what an earlier one has made of the thrust
+        ordered = tuple(sorted(hidden, key=names.index))
+        found.append(_sortie(generator, number, ordered, study.seconds, integral))
     return tuple(found)
 
 
@@ -361,37 +363,41 @@ def _work(study: Study, sortie: Sortie) -> Case:
 
 
 def run(study: Study, wanted: Sequence[Sortie], jobs: int, done: Callable[[Case], None]) -> tuple[Case, ...]:
-    """Fly and diagnose what the folder lacks, in `jobs` processes; `done` hears of each flight. In the order of
-    `wanted`.
+    """Fly and diagnose what the folder lacks; `done` hears of each flight. In the order of `wanted`.
 
-    When interrupted, flights under way are finished and kept, and the rest is not begun.
+    With `jobs` 1 here, otherwise in so many processes. When interrupted, flights under way are finished and kept, and
+    the rest is not begun.
     """
-    # each worker uses one core; the variables are read when the workers' numpy is loaded
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-    pool = ProcessPoolExecutor(
-        max(1, min(jobs, len(wanted))), get_context("spawn"), _leave_interrupts_to_parent
-    )
     cases: dict[int, Case] = {}
-    under_way = {pool.submit(_work, study, sortie): sortie for sortie in wanted}
     try:
-        for one in as_completed(under_way):
-            sortie = under_way[one]
-            try:
-                cases[sortie.number] = one.result()
-            except BrokenProcessPool:
-                raise InputError(
-                    f"{study.folder}: a process was ended from outside (out of memory?); the same command goes on, "
-                    "with fewer --jobs if need be"
-                ) from None
-            done(cases[sortie.number])
+        for case in _each(study, wanted, min(jobs, len(wanted))):
+            cases[case.number] = case
+            done(case)
+    except BrokenProcessPool:
+        raise InputError(
+            f"{study.folder}: a process was ended from outside (out of memory?); the same command goes on, with fewer "
+            "--jobs if need be"
+        ) from None
     except KeyboardInterrupt:
         raise InputError(
             f"interrupted: {len(cases)} of {len(wanted)} flights are done in {study.folder}; the same command goes on"
         ) from None
+    return tuple(cases[sortie.number] for sortie in wanted)
+
+
+def _each(study: Study, wanted: Sequence[Sortie], jobs: int) -> Iterator[Case]:
+    if jobs == 1:
+        yield from (_work(study, sortie) for sortie in wanted)
+        return
+    # each worker uses one core; the variables are read when the workers' numpy is loaded
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    # a fresh interpreter each: forking a process that has threads (the progress bar's) may hang
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _leave_interrupts_to_parent)
+    try:
+        yield from (one.result() for one in as_completed([pool.submit(_work, study, s) for s in wanted]))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-    return tuple(cases[sortie.number] for sortie in wanted)
 
 
 def _leave_interrupts_to_parent() -> None:

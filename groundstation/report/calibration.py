@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -218,40 +219,61 @@ def _turned(share: Table) -> Table:
     }
 
 
-CHARTS: dict[str, tuple[str, Callable[[Table, Colours], Figure], str]] = {
-    "shares": (
+@dataclass(frozen=True)
+class Chart:
+    """A chart with the section that it stands in: `alt` says in words what it shows; left out where the table has
+    nothing under `needs`."""
+
+    name: str
+    title: str
+    draw: Callable[[Table, Colours], Figure]
+    needs: str
+    alt: str
+
+
+CHARTS: tuple[Chart, ...] = (
+    Chart(
+        "shares",
         "How often it is right",
         shares,
+        "flights",
         "Dots with intervals: the share of flights whose hidden effects were all named, alone or in a group, and "
         "nothing false beside them; all flights, flights with nothing hidden, and by kind. The numbers stand in the "
         "table.",
     ),
-    "confusion": (
+    Chart(
+        "confusion",
         "What became of each effect",
         confusion,
+        "confusion",
         "Matrix: hidden effects in rows; called missing, named in a group, said not to be excited, and denied in "
         "columns, then the effects called missing in their place. The numbers stand in the table.",
     ),
-    "coverage": (
+    Chart(
+        "coverage",
         "Do the intervals hold the truth",
         coverage,
+        "coverage",
         "Dots with intervals: the share of 95 % intervals that hold the true value, of all and by effect, with a line "
         "at 95 %. The numbers stand in the table.",
     ),
-    "error": (
+    Chart(
+        "error",
         "Error against excitation",
         error,
+        "estimates",
         "Scatter, both axes logarithmic: relative error of each estimate over how far its effect stands out of the "
         "noise floor, with a line at 10 %.",
     ),
-    "reliability": (
+    Chart(
+        "reliability",
         "Is it as sure as it should be",
         reliability,
+        "claims",
         "Two panels, verdicts that an effect is there and that it is not: by how sure they say they are, the share "
         "that is right, with intervals, beside the dashed line of what they say. The numbers stand in the table.",
     ),
-}
-"""Charts by the section that shows them: title, drawing, and what it shows in words."""
+)
 
 
 def render_calibration(table: Table) -> str:
@@ -259,10 +281,11 @@ def render_calibration(table: Table) -> str:
     html, told = environment(html=True), Told(table)
     bodies = []
     with style():
-        for name, (title, draw, alt) in CHARTS.items():
-            chart = to_svg(draw(table, COLOURS), name, alt)
-            body = html.get_template(f"calibration/{name}.html").render(t=told, chart=chart)
-            bodies.append(({"name": name, "title": title}, Markup(body)))
+        for chart in CHARTS:
+            if table[chart.needs]:
+                drawn = to_svg(chart.draw(table, COLOURS), chart.name, chart.alt)
+                body = html.get_template(f"calibration/{chart.name}.html").render(t=told, chart=drawn)
+                bodies.append(({"name": chart.name, "title": chart.title}, Markup(body)))
     body = html.get_template("calibration/wrong.html").render(t=told)
     bodies.append(({"name": "wrong", "title": "What was wrong"}, Markup(body)))
     lines = html.get_template("calibration/verdict.txt").render(t=told).splitlines()
@@ -280,8 +303,10 @@ def write_calibration(folder: Path, table: Table) -> Path:
     write_report(folder / "calibration.json", json.dumps(table, indent=1, allow_nan=False) + "\n")
     try:
         with light_style():
-            for name, (_, draw, _) in CHARTS.items():
-                draw(table, LIGHT).savefig(folder / f"{name}.png", dpi=110, facecolor="white")
+            for chart in CHARTS:
+                if table[chart.needs]:
+                    made = chart.draw(table, LIGHT)
+                    made.savefig(folder / f"{chart.name}.png", dpi=110, facecolor="white")
     except OSError as error:
         raise InputError(
             f"{folder}: cannot write the charts ({error.strerror}); choose another --output"
