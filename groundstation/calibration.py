@@ -21,7 +21,7 @@ OUTCOMES = (MISSING, POSSIBLE, NOT_EXCITED, ABSENT)
 denied."""
 NOTHING = "nothing"
 """The row of the confusion matrix for what was named beside all that is true."""
-SURE = (0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
+SURE = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
 """Edges of the bins of the reliability diagram."""
 CALLED_SURE = 0.95
 
@@ -411,11 +411,11 @@ def claims_of(case: Case) -> list[Claim]:
 
 
 def reliability(claims: Sequence[Claim]) -> Reliability:
-    """The claims in bins of `SURE`; empty bins are left out, what is less sure than the first edge is in the first."""
+    """The claims in bins of `SURE`; empty bins are left out."""
     bins = []
     for i, (low, high) in enumerate(pairwise(SURE)):
         last = i == len(SURE) - 2
-        inside = [c for c in claims if (c.sure >= low or i == 0) and (c.sure < high or last)]
+        inside = [c for c in claims if low <= c.sure and (c.sure < high or last)]
         if inside:
             mean = float(np.mean([c.sure for c in inside]))
             bins.append(Bin(low, high, mean, proportion(c.right for c in inside)))

@@ -192,7 +192,7 @@ def test_claims_are_binned_by_how_sure_they_are() -> None:
     unsure = [Claim(k, "wind", True, 0.3, False) for k in range(3)]
     found = reliability(sure + unsure)
     assert [(b.low, b.high, b.right.count, b.right.of) for b in found.bins] == [
-        (0.5, 0.8, 0, 3),
+        (0.0, 0.5, 0, 3),
         (0.95, 0.99, 9, 10),
     ]
     assert (found.called_sure.count, found.called_sure.of) == (9, 10)
