@@ -161,9 +161,9 @@ def print_calibration(result: Calibration, folder: Path) -> None:
 
     table = Table(title="what became of the hidden effects", title_justify="left")
     table.add_column("hidden", no_wrap=True)
-    for heading in ("times", "missing", "in a group", "not excited", "denied"):
+    for heading in ("times", "missing", "in a\ngroup", "not\nexcited", "denied"):
         table.add_column(heading, justify="right")
-    table.add_column("called missing in its place")
+    table.add_column("called missing\nin its place", overflow="fold")
     for row in result.confusion:
         instead = ", ".join(f"{name} {count}" for name, count in row.instead.items())
         if row.effect == NOTHING:

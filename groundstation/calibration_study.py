@@ -111,9 +111,9 @@ class Study:
         text = json.dumps(self.settings(), indent=1)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            if index.exists():
+            if index.exists() and any(self.folder.glob("*.flight.json")):
                 self._same(json.loads(index.read_text(encoding="utf-8")), index)
-            elif any(self.folder.iterdir()):
+            elif not index.exists() and any(self.folder.iterdir()):
                 raise InputError(f"{self.folder}: holds files that are no study's; choose another --output")
             else:
                 _write(index, text)
