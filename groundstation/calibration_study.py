@@ -13,12 +13,13 @@ import math
 import os
 import random
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
@@ -318,6 +319,8 @@ def fly(study: Study, sortie: Sortie) -> dict[str, Any]:
             raise InputError(f"{kept}: was flown for another study; choose another --output")
         return told
     vehicle = load_vehicle(study.vehicle)
+    # of a run that was killed before it could tell
+    stem.with_suffix(".mcap").unlink(missing_ok=True)
     _write(stem.with_suffix(".setpoints.csv"), setpoints(path_of(sortie, vehicle)))
     report = run_json(command_of(study, sortie))
     truth = run_json(["sim-bridge", "reveal", stem.with_suffix(".sealed"), "--json"])
@@ -393,15 +396,24 @@ def _each(study: Study, wanted: Sequence[Sortie], jobs: int) -> Iterator[Case]:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     # a fresh interpreter each: forking a process that has threads (the progress bar's) may hang
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _leave_interrupts_to_parent)
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _serve_parent)
     try:
         yield from (one.result() for one in as_completed([pool.submit(_work, study, s) for s in wanted]))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _leave_interrupts_to_parent() -> None:
+def _serve_parent() -> None:
+    """Leave interrupts to the parent, and end when it does, however it does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    assert parent is not None
+
+    def end_with_it() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_it, daemon=True).start()
 
 
 def forget_diagnoses(study: Study) -> None:

@@ -286,7 +286,8 @@ def test_a_study_is_flown_diagnosed_continued_and_not_mixed_with_another(
     records = {path: path.stat().st_mtime_ns for path in folder.glob("*.mcap")}
     diagnosed = {path: path.stat().st_mtime_ns for path in folder.glob("*.diagnosis.json")}
     assert len(records) == len(diagnosed) == 1
-    # one more flight: the others stay as they are
+    # one more flight, that a run before left half-written: the others stay as they are
+    (folder / "0002.mcap").write_bytes(b"half")
     code, out, _ = run(capsys, monkeypatch, "--flights", 2, *words[2:])
     assert code == 0
     assert "2 flights" in out
