@@ -66,7 +66,7 @@ def reliability(table: Table, colours: Colours) -> Figure:
         ax.set_title(title)
         ax.set_xlabel("says it is sure")
     axes[0, 0].set_ylabel("share that is right")
-    axes[0, 0].legend(loc="center left")
+    axes[0, 1].legend(loc="center right")
     return made
 
 
