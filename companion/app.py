@@ -11,7 +11,7 @@ from typing import Any
 
 from companion.control import ControlLaw
 from companion.director import Director
-from companion.flight import Flight
+from companion.flight import IDLE, Flight
 from companion.settings import Settings
 from companion.store import ModelStore
 from companion.telemetry import Telemetry, make_event, read_json
@@ -81,6 +81,7 @@ class Companion:
         )
         self._vehicle_time_us = 0
         self._errors_told = 0
+        self._told_by_autopilot = ""
         self.telemetry = Telemetry(
             session,
             vehicle.name,
@@ -95,6 +96,7 @@ class Companion:
             self.emit("warning", "model_refused", f"no longer accepted: {reason}")
         self.link.on_odometry = self._control
         self.link.on_error = self._wire_error
+        self.link.on_notice = self._autopilot_tells
         try:
             self._settle_rates(settings.rate)
         except InputError:
@@ -145,6 +147,14 @@ class Companion:
         if recorder is not None:
             recorder.tick(data, odometry.vehicle_time_us, odometry.host_time_ns)
         self.telemetry.tick(data)
+
+    def _autopilot_tells(self, text: str) -> None:
+        """What the autopilot says of failsafes and switches belongs into the record of a flight, once."""
+        if self.flight.phase == IDLE:
+            self._told_by_autopilot = ""
+        elif text != self._told_by_autopilot:
+            self._told_by_autopilot = text
+            self.emit("warning", "autopilot", text)
 
     def _wire_error(self, text: str) -> None:
         self._errors_told += 1

@@ -233,11 +233,7 @@ class Director:
     def _command(self, command: str) -> dict[str, Any]:
         if command not in ("abort", "land"):
             return {"accepted": False, "reason": f"unknown command '{command}'; use abort or land"}
-        with self._lock:
-            waiting = len(self._queue)
-            for progress in self._queue:
-                progress.state, progress.reason = "aborted", f"{command} from the ground"
-            self._queue.clear()
+        waiting = self._drop_queue(f"{command} from the ground")
         if self.flight.phase == IDLE:
             done = f"{waiting} queued missions dropped; nothing is flying"
             return {"accepted": True, "reason": done}
@@ -375,6 +371,17 @@ class Director:
         # Told last: whoever hears that it is over may fetch the record, which must be whole by then.
         progress.reason = outcome
         progress.state = "finished" if outcome == "finished" else "aborted"
+        if progress.state == "aborted":
+            self._drop_queue("the flight before it ended early; ask again")
+
+    def _drop_queue(self, reason: str) -> int:
+        """Forget the missions that wait; the number of them. Whoever ended a flight early does not want the next."""
+        with self._lock:
+            waiting = len(self._queue)
+            for progress in self._queue:
+                progress.state, progress.reason = "aborted", reason
+            self._queue.clear()
+        return waiting
 
     def _renewed(self, progress: Progress) -> str:
         """What is live now flies, not what was when the mission was asked for; '' or the reason why not."""
@@ -405,13 +412,13 @@ class Director:
             return "no odometry, so no setpoint could be sent"
         reason = self.link.set_mode("OFFBOARD")
         if reason:
-            return f"the autopilot refused Offboard ({reason})"
+            return self._refused(f"the autopilot refused Offboard ({reason})")
         if not self._wait(lambda: latest.flight_mode == "OFFBOARD", _MODE_TIMEOUT):
             return f"the autopilot stayed in {latest.flight_mode}"
         self._record(progress)
         reason = self.link.arm()
         if reason:
-            return f"the autopilot refused to arm ({reason})"
+            return self._refused(f"the autopilot refused to arm ({reason})")
         if not self._wait(lambda: latest.armed, _ARM_TIMEOUT):
             return "the autopilot did not arm"
         if latest.flight_mode != "OFFBOARD":
@@ -423,6 +430,12 @@ class Director:
         if staged and flight.candidate is None:
             self._try(staged)
         return ""
+
+    def _refused(self, what: str) -> str:
+        """Why, in plain words, where the autopilot tells; asked while setpoints are still streaming."""
+        report = self.link.arming_report()
+        problems = report.reasons(streaming=True) if report is not None else ()
+        return f"{what}: {'; '.join(problem.line for problem in problems)}" if problems else what
 
     def _accompany(self) -> None:
         """Do what the flight asks for that may block, until it is over."""

@@ -425,9 +425,11 @@ class Flight:
                 one.start() if on else one.stop()
 
     def _watch_mode(self, latest: Latest) -> None:
-        """The pilot wins, and a vehicle that is not armed flies no more."""
+        """The pilot wins, so do the autopilot's failsafes, and a vehicle that is not armed flies no more."""
         if self._leg is None:  # streaming, not yet armed by us: `take_off` follows only on armed and Offboard
             return
+        if latest.killed and self.phase != SILENT:
+            self._silence("kill_switch", "the motors were cut by kill switch or termination: silent")
         if not latest.armed:
             if self.phase != LANDING and not self.outcome:
                 self.outcome = "the vehicle was disarmed in flight"
@@ -436,9 +438,11 @@ class Flight:
         elif latest.flight_mode != "OFFBOARD" and self.phase != SILENT:
             if self.wants_land and latest.flight_mode == "LAND":
                 return
-            self._silence(
-                "pilot_takeover", f"{latest.flight_mode} was chosen by the pilot or the autopilot: silent"
-            )
+            if latest.failsafe:
+                self._silence("failsafe", f"{latest.flight_mode} was chosen by the autopilot's failsafe: silent")
+            else:
+                text = f"{latest.flight_mode} was chosen by the pilot or a ground station: silent"
+                self._silence("pilot_takeover", text)
 
     def _watch(
         self, odometry: Odometry, previous: Odometry | None, interval: float, position: Vector, latest: Latest

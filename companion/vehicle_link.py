@@ -25,8 +25,9 @@ from typing import Any, NamedTuple
 import mavsdk
 from mavsdk.mavsdk import Configuration, Mavsdk
 from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
-from mavsdk.plugins.param import Param
+from mavsdk.plugins.param.param import Param, ParamError, ParamResult
 
+from companion.px4_events import ArmingChecks, ArmingReport, Px4Event, describe, unhealthy
 from models.errors import InputError
 
 Vector = tuple[float, float, float]
@@ -44,7 +45,7 @@ _MESSAGE_IDS = {
     "CURRENT_MODE": 436,
     "HEARTBEAT": 0,
 }
-_SET_MESSAGE_INTERVAL, _DO_SET_MODE, _ARM_DISARM = 511, 176, 400
+_SET_MESSAGE_INTERVAL, _DO_SET_MODE, _ARM_DISARM, _RUN_PREARM_CHECKS = 511, 176, 400, 401
 _ACCEPTED = 0
 _RESULTS = {
     1: "temporarily rejected",
@@ -55,6 +56,10 @@ _RESULTS = {
     6: "cancelled",
 }
 _ARMED = 128
+_CRITICAL, _TERMINATED = 5, 8  # MAV_STATE of a failsafe that acts, and of motors that are cut
+_GROUND_STATION_HEARTBEAT = (
+    '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
+)
 _MODES = {
     (1, 0): "MANUAL",
     (2, 0): "ALTCTL",
@@ -96,6 +101,8 @@ class Latest:
 
     `battery_voltage` V (0 unknown), `rotor_speed` rad/s (empty unknown). `imu` is HIGHRES_IMU as it came, not
     yet read: it arrives just before the odometry, and what it takes to read it would delay the setpoint.
+    `killed` while the motors are cut (kill switch, termination), `failsafe` where the mode is one that the
+    autopilot's failsafe chose, `unhealthy` what SYS_STATUS says is not well.
     """
 
     battery_voltage: float = 0.0
@@ -106,6 +113,9 @@ class Latest:
     heartbeat: float = -math.inf
     texts: deque[str] = field(default_factory=lambda: deque(maxlen=20))
     imu: str = ""
+    killed: bool = False
+    failsafe: bool = False
+    unhealthy: tuple[str, ...] = ()
 
     @property
     def specific_force(self) -> Vector | None:
@@ -141,7 +151,7 @@ class VehicleLink:
 
     Raises `InputError` where the address cannot be used or nobody answers within `timeout` s. `on_odometry`
     is called with each odometry message on the control thread; what it raises ends up in `on_error` and sends
-    nothing.
+    nothing. `on_notice` gets what the autopilot tells of failsafes, switches and failed checks, in plain words.
     """
 
     def __init__(self, address: str = "udpin://127.0.0.1:14540", timeout: float = 10.0) -> None:
@@ -150,11 +160,15 @@ class VehicleLink:
         self.on_odometry: Callable[[Odometry], None] = lambda odometry: None
         self.on_state: Callable[[], None] = lambda: None
         self.on_error: Callable[[str], None] = lambda text: None
+        self.on_notice: Callable[[str], None] = lambda text: None
         self.malformed = 0
         self._counts = dict.fromkeys(("ODOMETRY", "HIGHRES_IMU", "BATTERY_STATUS", "ESC_STATUS"), 0)
         self._times: deque[int] = deque(maxlen=4096)
         self._escs: dict[int, float] = {}
         self._param_lock = threading.Lock()
+        self._arming = ArmingChecks()
+        self._event_sequence = -1
+        self._text_number = 0
         # MAVSDK prints what it does in colour on standard output, which belongs to our caller.
         mavsdk.log_subscribe(lambda level, text, file, line: True)
         # A ground station's heartbeat would turn STATUSTEXT on, but PX4 then counts us as its data link.
@@ -187,6 +201,8 @@ class VehicleLink:
             ("CURRENT_MODE", self._current_mode),
             ("EXTENDED_SYS_STATE", self._landed),
             ("STATUSTEXT", self._text),
+            ("EVENT", self._event),
+            ("SYS_STATUS", self._system_status),
         ):
             self._direct.subscribe_message(name, self._safe(handler))
         self._direct.subscribe_message("HIGHRES_IMU", self._imu)
@@ -272,12 +288,52 @@ class VehicleLink:
         silent.
         """
         with self._param_lock:
-            for get in (self._param.get_param_float, self._param.get_param_int):
-                try:
-                    return get(name)
-                except mavsdk.MavsdkError:
-                    continue
-        return None
+            try:
+                return float(self._param.get_param_float(name))
+            except ParamError as error:
+                if error.result != ParamResult.WRONG_TYPE:
+                    return None
+            try:
+                return int(self._param.get_param_int(name))
+            except ParamError:
+                return None
+
+    def set_parameter(self, name: str, value: float | int) -> str:
+        """Set a parameter; an int is sent as INT32, a float as REAL32. Returns '' where the autopilot has taken
+        it, otherwise the reason.
+        """
+        with self._param_lock:
+            try:
+                if isinstance(value, int):
+                    self._param.set_param_int(name, value)
+                else:
+                    self._param.set_param_float(name, value)
+            except ParamError as error:
+                return error.result.name.lower().replace("_", " ")
+        now = self.parameter(name)
+        if now is None or abs(now - value) > 1e-6 * max(1.0, abs(value)):
+            return f"the autopilot kept {now}"
+        return ""
+
+    def arming_report(self, timeout: float = 2.0) -> ArmingReport | None:
+        """What the autopilot's arming checks say now; None where it does not tell (PX4 before 1.13, others).
+
+        The checks run again for this; the vehicle must be disarmed.
+        """
+        count = self._arming.count
+        refused = self.command(_RUN_PREARM_CHECKS)
+        end = time.monotonic() + timeout
+        while not refused and self._arming.count == count and time.monotonic() < end:
+            time.sleep(0.02)
+        return self._arming.report
+
+    def show_as_ground_station(self) -> None:
+        """One heartbeat of a ground station: PX4 sends STATUSTEXT for some seconds after it.
+
+        Only for a vehicle that does not fly: PX4 then takes us for its data link, and misses us later.
+        """
+        message = MavlinkMessage("HEARTBEAT", fields_json=_GROUND_STATION_HEARTBEAT)
+        self._direct.send_message(message)
 
     # What comes in
 
@@ -343,10 +399,15 @@ class VehicleLink:
             return
         self.latest.heartbeat = 1e-9 * fields["arrived"]
         self.latest.armed = bool(int(fields["base_mode"]) & _ARMED)
+        self.latest.killed = int(fields["system_status"]) == _TERMINATED
+        self.latest.failsafe = int(fields["system_status"]) == _CRITICAL
         self.latest.flight_mode = mode_name(int(fields["custom_mode"]))
         self.on_state()
 
     def _current_mode(self, fields: dict[str, Any]) -> None:
+        # PX4 keeps the mode that somebody chose apart from what its failsafes made of it.
+        intended, mode = int(fields["intended_custom_mode"]), int(fields["custom_mode"])
+        self.latest.failsafe = intended not in (0, mode)
         self.latest.flight_mode = mode_name(int(fields["custom_mode"]))
         self.on_state()
 
@@ -354,7 +415,27 @@ class VehicleLink:
         self.latest.landed = _LANDED.get(int(fields["landed_state"]), "unknown")
 
     def _text(self, fields: dict[str, Any]) -> None:
-        self.latest.texts.append(str(fields["text"]))
+        number, texts = int(fields.get("id", 0)), self.latest.texts
+        if number and number == self._text_number and int(fields.get("chunk_seq", 0)) and texts:
+            texts[-1] += str(fields["text"])  # a long text comes in pieces
+        else:
+            texts.append(str(fields["text"]))
+        self._text_number = number
+
+    def _event(self, fields: dict[str, Any]) -> None:
+        if fields["component"] != _AUTOPILOT or int(fields["sequence"]) == self._event_sequence:
+            return
+        self._event_sequence = int(fields["sequence"])
+        arguments = bytes(int(byte) for byte in fields["arguments"])
+        event = Px4Event(int(fields["id"]), int(fields["log_levels"]) & 0xF, arguments)
+        self._arming.take(event)
+        text = describe(event)
+        if text:
+            self.on_notice(text)
+
+    def _system_status(self, fields: dict[str, Any]) -> None:
+        enabled = int(fields["onboard_control_sensors_enabled"])
+        self.latest.unhealthy = unhealthy(enabled, int(fields["onboard_control_sensors_health"]))
 
 
 def without_covariance(text: str) -> str:
