@@ -17,8 +17,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from companion.flight import IDLE, LANDING, SILENT, TAKEOFF, Decision, Flight, Mission, Safety
+from companion.flight import IDLE, LANDING, MISSION, SILENT, TAKEOFF, Decision, Flight, Mission, Safety
 from companion.guard import Guard
+from companion.message_rates import link_too_slow, odometry_too_low
+from companion.pose import PoseFeed
 from companion.shadow import Shadow, ShadowLimits
 from companion.store import ModelStore
 from companion.vehicle_link import Rates, VehicleLink
@@ -39,7 +41,6 @@ _STALLED, _GONE = (
     0.5,
     10.0,
 )  # s without a tick that are told, and without any sign of the vehicle that end a flight
-_RATE_SHARE = 0.75
 _ORDER_TIMEOUT = 0.2  # s for the next tick
 _SHADOW_SECONDS = (0.5, 600.0)
 _MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
@@ -75,6 +76,7 @@ class Director:
     emit: Callable[[str, str, str], None]
     recorder: FlightRecorder | None = None
     rates: Rates | None = None
+    pose: PoseFeed | None = None
     stopping: threading.Event = field(default_factory=threading.Event)
     _queue: deque[Progress] = field(default_factory=deque)
     _known: dict[str, Progress] = field(default_factory=dict)
@@ -196,6 +198,7 @@ class Director:
             "rates": {}
             if rates is None
             else {"odometry": round(rates.odometry, 1), "imu": round(rates.imu, 1)},
+            "pose": {} if self.pose is None else self.pose.status(),
             "recording": str(self.recorder.path) if self.recorder else "",
             "malformed_messages": self.link.malformed,
             **self.store.describe(),
@@ -213,21 +216,21 @@ class Director:
         low = self.safety.takeoff_voltage * self.vehicle.nominal_voltage
         if 0.0 < latest.battery_voltage < low:
             return f"the battery has {latest.battery_voltage:.1f} V, a flight needs {low:.1f} V"
+        if self.pose is not None and self.pose.why_not:
+            return self.pose.why_not
         return self.rates_too_low(self.rates)
 
     def rates_too_low(self, rates: Rates | None) -> str:
         """'' where odometry and accelerometer arrive often enough, otherwise what is missing."""
         if rates is None:
             return "rates have not been measured yet"
-        if rates.odometry < _RATE_SHARE * self.rate:
-            return (
-                f"odometry arrives at {rates.odometry:.0f} Hz, {self.rate:.0f} Hz were asked for; "
-                "lower --rate, or let the autopilot send more (PX4: EKF2_PREDICT_US, the link's MAV_x_RATE)"
-            )
+        too_low = odometry_too_low(rates, self.rate)
+        if too_low:
+            return too_low
         if rates.longest_gap > self.safety.odometry_gap:
             return f"odometry had a gap of {rates.longest_gap:.2f} s; the link or this machine is too busy"
         if rates.imu < 0.5 * min(self.rate, 100.0):
-            return f"HIGHRES_IMU arrives at {rates.imu:.0f} Hz; the link is too slow for it (PX4: MAV_x_RATE)"
+            return link_too_slow(f"HIGHRES_IMU at {rates.imu:.0f} Hz")
         return ""
 
     def _command(self, command: str) -> dict[str, Any]:
@@ -453,6 +456,8 @@ class Director:
                 reason = self.link.set_mode("LAND")
                 if reason and tries >= _LAND_TRIES:
                     flight.give_up(f"the autopilot refused Land ({reason})")
+            if self.pose is not None and flight.phase in (TAKEOFF, MISSION) and self.pose.why_not:
+                flight.land(self.pose.why_not, return_home=False)
             on_ground = latest.landed == "on ground" and flight.phase != TAKEOFF and not flight.sending
             grounded = min(grounded, now) if on_ground else math.inf
             if now - grounded > _DISARM_AFTER and latest.armed and flight.phase == LANDING:

@@ -190,7 +190,6 @@ CHECKS: dict[str, tuple[str, str]] = {
     "commander_arm_denied_calibrating": ("a calibration is under way", "wait for its end"),
     "commander_arm_denied_throttle_high": ("the throttle stick is not down", "pull it down"),
     "commander_arm_denied_throttle_center": ("the throttle stick is not centred", "centre it"),
-    "commander_arm_denied_resolve_failures": ("checks have failed", "see the others"),
     "commander_disarm_denied_not_landed": ("not disarmed: the vehicle is not on the ground", ""),
     "commander_kill_sw_engaged": ("the kill switch was switched on", ""),
     "commander_kill_sw_disengaged": ("the kill switch was switched off", ""),
@@ -238,7 +237,7 @@ def describe(event: Px4Event) -> str:
         cause = _name_of(_CAUSES, event.arguments, cause_at)
         return f"failsafe: {cause or _CAUSES[0]}, {action or _ACTIONS[1]}"
     name = _NAMES.get(event.number)
-    if name is None or name == NO_SETPOINTS or (event.level > WARNING and name not in _TOLD_ANYWAY):
+    if name is None or name == NO_SETPOINTS or (event.level > ERROR and name not in _TOLD_ANYWAY):
         return ""
     return CHECKS[name][0]
 

@@ -23,12 +23,23 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import mavsdk
+import numpy as np
 from mavsdk.mavsdk import Configuration, Mavsdk
 from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
+from mavsdk.plugins.mocap.mocap import (
+    AngleBody,
+    Covariance,
+    Mocap,
+    MocapError,
+    PositionBody,
+    VisionPositionEstimate,
+)
 from mavsdk.plugins.param.param import Param, ParamError, ParamResult
 
 from companion.px4_events import ArmingChecks, ArmingReport, Px4Event, describe, unhealthy
+from models import frames
 from models.errors import InputError
+from models.pose import Pose
 
 Vector = tuple[float, float, float]
 
@@ -44,8 +55,10 @@ _MESSAGE_IDS = {
     "EXTENDED_SYS_STATE": 245,
     "CURRENT_MODE": 436,
     "HEARTBEAT": 0,
+    "AUTOPILOT_VERSION": 148,
 }
-_SET_MESSAGE_INTERVAL, _DO_SET_MODE, _ARM_DISARM, _RUN_PREARM_CHECKS = 511, 176, 400, 401
+_SET_MESSAGE_INTERVAL, _DO_SET_MODE, _ARM_DISARM = 511, 176, 400
+_RUN_PREARM_CHECKS, _REQUEST_MESSAGE = 401, 512
 _ACCEPTED = 0
 _RESULTS = {
     1: "temporarily rejected",
@@ -168,7 +181,8 @@ class VehicleLink:
         self._param_lock = threading.Lock()
         self._arming = ArmingChecks()
         self._event_sequence = -1
-        self._text_number = 0
+        self._text_number = -1
+        self._version = ""
         # MAVSDK prints what it does in colour on standard output, which belongs to our caller.
         mavsdk.log_subscribe(lambda level, text, file, line: True)
         # A ground station's heartbeat would turn STATUSTEXT on, but PX4 then counts us as its data link.
@@ -192,6 +206,7 @@ class VehicleLink:
             )
         self._system = system.get_system_id()
         self._param = Param(system)
+        self._mocap = Mocap(system)
         self._direct = MavlinkDirect(system)
         for name, handler in (
             ("ODOMETRY", self._odometry),
@@ -203,6 +218,7 @@ class VehicleLink:
             ("STATUSTEXT", self._text),
             ("EVENT", self._event),
             ("SYS_STATUS", self._system_status),
+            ("AUTOPILOT_VERSION", self._autopilot_version),
         ):
             self._direct.subscribe_message(name, self._safe(handler))
         self._direct.subscribe_message("HIGHRES_IMU", self._imu)
@@ -230,6 +246,17 @@ class VehicleLink:
                 f'"body_pitch_rate":{-q:.7g},"body_yaw_rate":{-r:.7g},"thrust":{thrust:.7g}}}',
             )
         )
+
+    def send_pose(self, pose: Pose, taken_us: int, reset_counter: int) -> None:
+        """One VISION_POSITION_ESTIMATE, taken `taken_us` microseconds since 1970 by this machine's clock.
+
+        PX4's estimator takes this message and ODOMETRY alone, and MAVSDK's ODOMETRY names a frame that PX4 no
+        longer reads. Raises `RuntimeError` where MAVSDK refuses it.
+        """
+        try:
+            self._mocap.set_vision_position_estimate(vision_estimate(pose, taken_us, reset_counter))
+        except MocapError as error:
+            raise RuntimeError(error.result.name.lower().replace("_", " ")) from None
 
     def set_mode(self, mode: str) -> str:
         """Ask for a flight mode (OFFBOARD, LAND, HOLD); returns '' where accepted, otherwise the reason."""
@@ -327,6 +354,14 @@ class VehicleLink:
             time.sleep(0.02)
         return self._arming.report
 
+    def autopilot_version(self, timeout: float = 1.0) -> str:
+        """Such as 'PX4 1.15.2'; 'unknown' where the autopilot does not tell."""
+        self.command(_REQUEST_MESSAGE, float(_MESSAGE_IDS["AUTOPILOT_VERSION"]))
+        end = time.monotonic() + timeout
+        while not self._version and time.monotonic() < end:
+            time.sleep(0.02)
+        return self._version or "unknown"
+
     def show_as_ground_station(self) -> None:
         """One heartbeat of a ground station: PX4 sends STATUSTEXT for some seconds after it.
 
@@ -415,11 +450,11 @@ class VehicleLink:
         self.latest.landed = _LANDED.get(int(fields["landed_state"]), "unknown")
 
     def _text(self, fields: dict[str, Any]) -> None:
-        number, texts = int(fields.get("id", 0)), self.latest.texts
-        if number and number == self._text_number and int(fields.get("chunk_seq", 0)) and texts:
-            texts[-1] += str(fields["text"])  # a long text comes in pieces
+        number, text, texts = int(fields.get("id", 0)), str(fields["text"]).rstrip("\t"), self.latest.texts
+        if texts and number == self._text_number and int(fields.get("chunk_seq", 0)):
+            texts[-1] += text  # a long text comes in pieces
         else:
-            texts.append(str(fields["text"]))
+            texts.append(text)
         self._text_number = number
 
     def _event(self, fields: dict[str, Any]) -> None:
@@ -433,9 +468,33 @@ class VehicleLink:
         if text:
             self.on_notice(text)
 
+    def _autopilot_version(self, fields: dict[str, Any]) -> None:
+        version = int(fields["flight_sw_version"])
+        self._version = f"PX4 {version >> 24 & 0xFF}.{version >> 16 & 0xFF}.{version >> 8 & 0xFF}"
+
     def _system_status(self, fields: dict[str, Any]) -> None:
         enabled = int(fields["onboard_control_sensors_enabled"])
         self.latest.unhealthy = unhealthy(enabled, int(fields["onboard_control_sensors_health"]))
+
+
+def vision_estimate(pose: Pose, taken_us: int, reset_counter: int) -> VisionPositionEstimate:
+    """A pose in ENU and FLU as the autopilot wants it: NED, and roll, pitch, yaw of FRD."""
+    north, east, down = (float(x) for x in frames.enu_from_ned(np.array(pose.position)))
+    attitude = frames.enu_flu_from_ned_frd(np.array(pose.quaternion))
+    roll, pitch, yaw = (float(x) for x in frames.euler_from_quaternion(attitude))
+    covariance = [math.nan]
+    if math.isfinite(pose.position_std) and math.isfinite(pose.attitude_std):
+        # The upper right triangle, row by row, of x, y, z, roll, pitch, yaw.
+        covariance = [0.0] * 21
+        for i, std in zip((0, 6, 11, 15, 18, 20), (pose.position_std,) * 3 + (pose.attitude_std,) * 3, strict=True):
+            covariance[i] = std * std
+    return VisionPositionEstimate(
+        taken_us,
+        PositionBody(north, east, down),
+        AngleBody(roll, pitch, yaw),
+        Covariance(covariance),
+        reset_counter,
+    )
 
 
 def without_covariance(text: str) -> str:
