@@ -428,8 +428,8 @@ class Flight:
         """The pilot wins, so do the autopilot's failsafes, and a vehicle that is not armed flies no more."""
         if self._leg is None:  # streaming, not yet armed by us: `take_off` follows only on armed and Offboard
             return
-        if latest.killed and self.phase != SILENT:
-            self._silence("kill_switch", "the motors were cut by kill switch or termination: silent")
+        if (latest.killed or latest.flight_mode == "TERMINATION") and self.phase != SILENT:
+            self._silence("kill_switch", f"the motors were cut{_because(latest)}: silent")
         if not latest.armed:
             if self.phase != LANDING and not self.outcome:
                 self.outcome = "the vehicle was disarmed in flight"
@@ -439,9 +439,11 @@ class Flight:
             if self.wants_land and latest.flight_mode == "LAND":
                 return
             if latest.failsafe:
-                self._silence("failsafe", f"{latest.flight_mode} was chosen by the autopilot's failsafe: silent")
+                text = f"{latest.flight_mode} was chosen by the autopilot's failsafe{_because(latest)}: silent"
+                self._silence("failsafe", text)
             else:
-                text = f"{latest.flight_mode} was chosen by the pilot or a ground station: silent"
+                who = f"the pilot or a ground station{_because(latest)}"
+                text = f"{latest.flight_mode} was chosen by {who}: silent"
                 self._silence("pilot_takeover", text)
 
     def _watch(
@@ -558,6 +560,11 @@ class Flight:
         shadow, self.candidate = self.candidate, None
         if shadow is not None:
             self.decisions.append(Decision("undecided", shadow.name))
+
+
+def _because(latest: Latest) -> str:
+    """What the autopilot told just now, in brackets."""
+    return f" ({latest.why})" if latest.why else ""
 
 
 def _finite(force: Vector | None) -> Vector | None:

@@ -88,9 +88,11 @@ _MODES = {
     (6, 0): "OFFBOARD",
     (7, 0): "STABILIZED",
     (8, 0): "RATTITUDE",
+    (10, 0): "TERMINATION",
 }
 _MODE_NUMBERS = {"OFFBOARD": (6, 0), "LAND": (4, 6), "HOLD": (4, 3)}
 _LANDED = {0: "unknown", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
+_RECENT = 2.0  # s
 _RPM = 2.0 * math.pi / 60.0
 _AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 
@@ -115,7 +117,8 @@ class Latest:
     `battery_voltage` V (0 unknown), `rotor_speed` rad/s (empty unknown). `imu` is HIGHRES_IMU as it came, not
     yet read: it arrives just before the odometry, and what it takes to read it would delay the setpoint.
     `killed` while the motors are cut (kill switch, termination), `failsafe` where the mode is one that the
-    autopilot's failsafe chose, `unhealthy` what SYS_STATUS says is not well.
+    autopilot's failsafe chose, `unhealthy` what SYS_STATUS says is not well, `notices` what it told of failsafes,
+    switches and failed checks (monotonic s, text).
     """
 
     battery_voltage: float = 0.0
@@ -129,6 +132,13 @@ class Latest:
     killed: bool = False
     failsafe: bool = False
     unhealthy: tuple[str, ...] = ()
+    notices: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=4))
+
+    @property
+    def why(self) -> str:
+        """What the autopilot told in the last seconds, in plain words; '' where nothing."""
+        now = time.monotonic()
+        return "; ".join(text for told, text in tuple(self.notices) if now - told < _RECENT)
 
     @property
     def specific_force(self) -> Vector | None:
@@ -466,6 +476,7 @@ class VehicleLink:
         self._arming.take(event)
         text = describe(event)
         if text:
+            self.latest.notices.append((time.monotonic(), text))
             self.on_notice(text)
 
     def _autopilot_version(self, fields: dict[str, Any]) -> None:
