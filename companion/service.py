@@ -132,7 +132,7 @@ def _configured(values: dict[str, str]) -> str:
     text = Path(__file__).with_name("companion.toml").read_text(encoding="utf-8")
     for key, value in values.items():
         text, count = re.subn(
-            rf"^(?:# )?{key} = [^#\n]*", lambda _: f"{key} = {value}".ljust(38), text, count=1, flags=re.MULTILINE
+            rf"^(?:# )?{key} = [^#\n]*", lambda _: f"{key} = {value} ".ljust(38), text, count=1, flags=re.MULTILINE
         )
         assert count == 1, key
     return re.sub(r"[ ]+$", "", text, flags=re.MULTILINE)
