@@ -97,7 +97,7 @@ def _serial(settings: Settings, root: Path) -> Iterator[Finding]:
         advice = f"100 Hz of control need {_BAUD} (PX4: SER_TEL2_BAUD {_BAUD} 8N1)"
         yield Finding("baud rate", speed or "not given", "", advice, WARN)
     short = Path(name).name
-    aliases = {short} | {"serial0"} * (path.resolve() == (root / "dev/serial0").resolve())
+    aliases = {short, "serial0"} if path.resolve() == (root / "dev/serial0").resolve() else {short}
     words = _text(root / "proc/cmdline").split()
     consoles = {word.removeprefix("console=").partition(",")[0] for word in words if word.startswith("console=")}
     if consoles & aliases:
@@ -113,7 +113,7 @@ def _rates(settings: Settings, root: Path) -> Iterator[Finding]:
         link = VehicleLink(settings.connect, settings.timeout)
     except InputError as error:
         advice = "power it; cable: TX to RX; PX4: MAV_1_CONFIG 102 (TELEM2), MAV_1_MODE 2 (Onboard)"
-        yield Finding("autopilot", str(error), "", advice, FAIL)
+        yield Finding("autopilot", "none", "", f"{error}; {advice}", FAIL)
         return
     try:
         link.request_rates(settings.rate)
@@ -274,7 +274,7 @@ def _model(settings: Settings, root: Path) -> Iterator[Finding]:
         load_design(settings.design_path, vehicle)
         yield Finding("design", str(settings.design_path), "", "", OK)
     except InputError as error:
-        yield Finding("design" if vehicle else "vehicle file", str(error), "", "", FAIL)
+        yield Finding("design" if vehicle else "vehicle file", "cannot be used", "", str(error), FAIL)
     if vehicle is None:
         return
     path = live_file(Path(settings.models))
