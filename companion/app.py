@@ -100,6 +100,7 @@ class Companion:
         if settings.pose.enabled:
             self.pose = PoseFeed(settings.pose, self.link.send_pose, self.emit)
             self.director.pose = self.pose
+            self.link.share_clock()
             self.telemetry.subscribe("pose", self.pose.take)
         for reason in store.refused_at_start:
             self.emit("warning", "model_refused", f"no longer accepted: {reason}")

@@ -23,6 +23,7 @@ _WAITING = 8
 _TOLD_AGAIN = 2.0
 """Seconds until the same trouble is told again."""
 _KEPT = 1000
+_WINDOW = 0.1  # s over which the velocity is taken
 _FUTURE = 0.01
 """s that a time stamp may lie ahead of this machine's clock: two clocks kept by NTP on one network agree so far."""
 
@@ -32,9 +33,10 @@ class PoseSettings:
     """Section `[pose]`.
 
     `clock` "sender" takes the time stamps of the poses, "arrival" the time of their arrival. `latency` s from the
-    picture to that time. A pose older than `stale` s is not passed on, nor one further than `jump` m and `turn` rad
-    from where `speed` m/s and `spin` rad/s could have brought the vehicle; poses that stay together elsewhere for
-    `settle` s are believed again. `lost` s without a good pose end a flight.
+    picture to that time. A pose older than `stale` s is not passed on, nor one that lies more than `jump` m from where
+    the last velocity and `acceleration` m/s² could have brought the vehicle, or more than `turn` rad from where
+    `spin` rad/s could have turned it; poses that stay together elsewhere for `settle` s are believed again. `lost` s
+    without a good pose end a flight.
     """
 
     enabled: bool = False
@@ -43,8 +45,8 @@ class PoseSettings:
     stale: float = 0.1
     jump: float = 0.2
     turn: float = 0.35
-    speed: float = 8.0
-    spin: float = 8.0
+    acceleration: float = 20.0
+    spin: float = 6.0
     settle: float = 1.0
     lost: float = 0.5
 
@@ -61,7 +63,7 @@ class PoseGate:
     def __init__(self, settings: PoseSettings) -> None:
         self.settings = settings
         self.reset_counter = 0
-        self._good: tuple[float, Pose] | None = None
+        self._good: deque[tuple[float, Pose]] = deque(maxlen=_KEPT)
         self._other: tuple[float, float, Pose] | None = None
 
     def judge(self, pose: Pose, taken: float, now: float) -> str:
@@ -72,23 +74,40 @@ class PoseGate:
             return f"stale: {age:.2f} s old (are both clocks kept by NTP? otherwise set [pose] clock = 'arrival')"
         if age < -_FUTURE:
             return f"from the future: {-age:.2f} s ahead (are both clocks kept by NTP?)"
-        if self._good is not None:
-            then, last = self._good
+        if self._good:
+            then, last = self._good[-1]
             if taken <= then:
                 return "out of order: not newer than the one before"
-            if not self._near(last, pose, min(taken - then, settings.stale)):
+            dt = taken - then
+            expected = tuple(
+                p + v * min(dt, settings.lost) for p, v in zip(last.position, self._velocity(), strict=True)
+            )
+            if not self._near(expected, last, pose, dt):
                 if not self._settled(pose, taken):
-                    away = math.dist(last.position, pose.position)
+                    away = math.dist(expected, pose.position)
                     turned = math.degrees(_angle(last, pose))
-                    return f"jump: {away:.2f} m and {turned:.0f} degrees within {1e3 * (taken - then):.0f} ms"
+                    return f"jump: {away:.2f} m and {turned:.0f} degrees within {1e3 * dt:.0f} ms"
                 self.reset_counter = (self.reset_counter + 1) % 256
-        self._good, self._other = (taken, pose), None
+                self._good.clear()
+        self._good.append((taken, pose))
+        while self._good[-1][0] - self._good[0][0] > _WINDOW:
+            self._good.popleft()
+        self._other = None
         return ""
 
-    def _near(self, last: Pose, pose: Pose, dt: float) -> bool:
+    def _velocity(self) -> tuple[float, float, float]:
+        """m/s over the last good poses; zero before there are enough of them."""
+        (begin, first), (end, last) = self._good[0], self._good[-1]
+        if end - begin < 0.2 * _WINDOW:
+            return (0.0, 0.0, 0.0)
+        vx, vy, vz = ((b - a) / (end - begin) for a, b in zip(first.position, last.position, strict=True))
+        return vx, vy, vz
+
+    def _near(self, expected: tuple[float, ...], last: Pose, pose: Pose, dt: float) -> bool:
         settings = self.settings
+        dt = min(dt, settings.stale)  # what is not known for longer is not allowed for more
         return (
-            math.dist(last.position, pose.position) <= settings.jump + settings.speed * dt
+            math.dist(expected, pose.position) <= settings.jump + 0.5 * settings.acceleration * dt * dt
             and _angle(last, pose) <= settings.turn + settings.spin * dt
         )
 
@@ -96,7 +115,7 @@ class PoseGate:
         """Whether poses elsewhere have stayed together for long enough."""
         if self._other is not None:
             since, then, last = self._other
-            if taken <= then or self._near(last, pose, min(taken - then, self.settings.stale)):
+            if taken <= then or self._near(last.position, last, pose, taken - then):
                 self._other = (since, max(taken, then), pose)
                 return taken - since >= self.settings.settle
         self._other = (taken, taken, pose)
@@ -197,20 +216,21 @@ class PoseFeed:
             self._refuse("no time", "it has no 'time_ns'; send one, or set [pose] clock = 'arrival'")
             return
         stamp = pose.time_ns if settings.clock == SENDER else arrived_ns
-        taken, now = 1e-9 * stamp - settings.latency, 1e-9 * time.time_ns()
+        taken_ns = stamp - round(1e9 * settings.latency)
+        taken, now = 1e-9 * taken_ns, 1e-9 * time.time_ns()
         reason = self._gate.judge(pose, taken, now)
         if reason:
             self._refuse(reason.partition(":")[0], reason)
             return
         try:
-            self._send(pose, round(1e6 * taken), self._gate.reset_counter)
+            self._send(pose, taken_ns // 1000, self._gate.reset_counter)
         except RuntimeError as error:
             self._refuse("not sent", str(error))
             return
         self._passed += 1
         self._last = time.monotonic()
         self._times.append(self._last)
-        self._ages.append(now - taken)
+        self._ages.append(1e-9 * (time.time_ns() - taken_ns))
         self._handling.append(1e-9 * (time.monotonic_ns() - arrived_mono_ns))
 
     def _refuse(self, kind: str, text: str) -> None:

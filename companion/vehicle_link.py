@@ -56,6 +56,7 @@ _MESSAGE_IDS = {
     "CURRENT_MODE": 436,
     "HEARTBEAT": 0,
     "AUTOPILOT_VERSION": 148,
+    "TIMESYNC": 111,
 }
 _SET_MESSAGE_INTERVAL, _DO_SET_MODE, _ARM_DISARM = 511, 176, 400
 _RUN_PREARM_CHECKS, _REQUEST_MESSAGE = 401, 512
@@ -93,6 +94,7 @@ _MODES = {
 _MODE_NUMBERS = {"OFFBOARD": (6, 0), "LAND": (4, 6), "HOLD": (4, 3)}
 _LANDED = {0: "unknown", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
 _RECENT = 2.0  # s
+_TIMESYNC_RATE = 50.0  # Hz; PX4 wants 500 answers
 _RPM = 2.0 * math.pi / 60.0
 _AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 
@@ -256,6 +258,15 @@ class VehicleLink:
                 f'"body_pitch_rate":{-q:.7g},"body_yaw_rate":{-r:.7g},"thrust":{thrust:.7g}}}',
             )
         )
+
+    def share_clock(self) -> None:
+        """Answer the autopilot's questions for our time, so that it understands the time stamps of poses.
+
+        MAVSDK leaves them unanswered, and PX4 then takes a pose for one of the moment of its arrival. It believes
+        the answers after 500 of them.
+        """
+        self._direct.subscribe_message("TIMESYNC", self._safe(self._timesync))
+        self.command(_SET_MESSAGE_INTERVAL, float(_MESSAGE_IDS["TIMESYNC"]), 1e6 / _TIMESYNC_RATE)
 
     def send_pose(self, pose: Pose, taken_us: int, reset_counter: int) -> None:
         """One VISION_POSITION_ESTIMATE, taken `taken_us` microseconds since 1970 by this machine's clock.
@@ -482,6 +493,20 @@ class VehicleLink:
     def _autopilot_version(self, fields: dict[str, Any]) -> None:
         version = int(fields["flight_sw_version"])
         self._version = f"PX4 {version >> 24 & 0xFF}.{version >> 16 & 0xFF}.{version >> 8 & 0xFF}"
+
+    def _timesync(self, fields: dict[str, Any]) -> None:
+        if fields["component"] != _AUTOPILOT or int(fields["tc1"]):
+            return
+        ours = time.time_ns() - (time.monotonic_ns() - fields["arrived"])
+        answer = f'{{"tc1":{ours},"ts1":{fields["ts1"]},"target_system":{self._system},"target_component":1}}'
+        self._direct.send_message(
+            MavlinkMessage(
+                "TIMESYNC",
+                target_system_id=self._system,
+                target_component_id=_AUTOPILOT,
+                fields_json=answer,
+            )
+        )
 
     def _system_status(self, fields: dict[str, Any]) -> None:
         enabled = int(fields["onboard_control_sensors_enabled"])
