@@ -29,6 +29,7 @@ Number = int | float
 _SLOW, _TILT = 0.2, 0.1
 """m/s and rad below which a recorded sample counts as hover."""
 _HOVER_SECONDS = 2.0
+_PATIENCE = 5.0  # s for a first heartbeat
 _HOVER_HEIGHT = 0.5  # m, out of ground effect
 _HOVER_NEAR, _HOVER_FAR = 0.10, 0.30
 """Relative difference of hover thrusts that is told, and with which nothing should take off: the cascade has no
@@ -221,6 +222,11 @@ def look(
 
     `progress` is told what is being looked at. The vehicle must be disarmed: raises `InputError` otherwise.
     """
+    end = time.monotonic() + _PATIENCE
+    while link.latest.heartbeat == -math.inf:  # until the first one every state is only a default
+        if time.monotonic() > end:
+            raise InputError(f"{link.address}: no heartbeat of the autopilot's own; is the link a one-way one?")
+        time.sleep(0.02)
     if link.latest.armed:
         raise InputError("the vehicle is armed; disarm it, then look again")
     progress("message rates")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rig import VEHICLE, Bridge, free_port
+from rig import VEHICLE, Bridge, free_port, wait_for
 from test_companion_cli import companion
 
 from companion.message_rates import odometry_too_low
@@ -105,7 +105,7 @@ def test_an_armed_vehicle_is_left_alone(bridge: tuple[Bridge, int], tmp_path: Pa
     port = bridge[1]
     link = VehicleLink(f"udpin://127.0.0.1:{port}")
     bridge[0].pilot("POSCTL")
-    assert link.arm() == ""
+    wait_for(lambda: link.arm() == "", "the estimator to be ready")
     link.close()
     result = companion("preflight", "--connect", f"udpin://127.0.0.1:{port}", "--vehicle", VEHICLE)
     assert result.returncode == 2
