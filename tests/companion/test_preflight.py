@@ -86,8 +86,10 @@ def test_what_refuses_arming_is_told_in_words_and_hover_thrust_compared(
 
 def test_too_low_a_rate_names_the_parameter(bridge: tuple[Bridge, int], tmp_path: Path) -> None:
     port = bridge[1]
-    code, report = look(port, "--records", tmp_path, "--rate", 400)
-    assert code == 0 or rows(report, "rates")["odometry"]["state"] == "ok"
+    _, report = look(port, "--records", tmp_path, "--rate", 900)
+    odometry = rows(report, "rates")["odometry"]
+    assert odometry["state"] == "fail"
+    assert "EKF2_PREDICT_US to 1000" in odometry["why"]
     slow = Rates(odometry=125.0, imu=250.0, battery=10.0, esc=0.0, longest_gap=0.01, duration=1.0)
     assert odometry_too_low(slow, 100.0) == ""
     reason = odometry_too_low(slow, 250.0)
@@ -104,9 +106,11 @@ def test_an_armed_vehicle_is_left_alone(bridge: tuple[Bridge, int], tmp_path: Pa
 
     port = bridge[1]
     link = VehicleLink(f"udpin://127.0.0.1:{port}")
-    bridge[0].pilot("POSCTL")
-    wait_for(lambda: link.arm() == "", "the estimator to be ready")
-    link.close()
+    try:
+        bridge[0].pilot("POSCTL")
+        wait_for(lambda: link.arm() == "", "the estimator to be ready")
+    finally:
+        link.close()
     result = companion("preflight", "--connect", f"udpin://127.0.0.1:{port}", "--vehicle", VEHICLE)
     assert result.returncode == 2
     assert "the vehicle is armed" in result.stderr
