@@ -218,7 +218,22 @@ class Director:
             return f"the battery has {latest.battery_voltage:.1f} V, a flight needs {low:.1f} V"
         if self.pose is not None and self.pose.why_not:
             return self.pose.why_not
+        if self.lost_position:
+            return self.lost_position
         return self.rates_too_low(self.rates)
+
+    @property
+    def lost_position(self) -> str:
+        """'' where the estimator has a position that is good enough, or says nothing of it."""
+        accuracy, most = self.link.latest.position_accuracy, self.safety.position_accuracy
+        if accuracy <= most:
+            return ""
+        told = (
+            f"knows the position to {accuracy:.1f} m only" if math.isfinite(accuracy) else "has no position"
+        )
+        return (
+            f"the autopilot's estimator {told}; a flight needs {most:g} m (GPS, or mocap with EKF2_EV_CTRL)"
+        )
 
     def rates_too_low(self, rates: Rates | None) -> str:
         """'' where odometry and accelerometer arrive often enough, otherwise what is missing."""
@@ -456,8 +471,10 @@ class Director:
                 reason = self.link.set_mode("LAND")
                 if reason and tries >= _LAND_TRIES:
                     flight.give_up(f"the autopilot refused Land ({reason})")
-            if self.pose is not None and flight.phase in (TAKEOFF, MISSION) and self.pose.why_not:
-                flight.land(self.pose.why_not, return_home=False)
+            if flight.phase in (TAKEOFF, MISSION):
+                blind = (self.pose.why_not if self.pose is not None else "") or self.lost_position
+                if blind:
+                    flight.land(blind, return_home=False)
             on_ground = latest.landed == "on ground" and flight.phase != TAKEOFF and not flight.sending
             grounded = min(grounded, now) if on_ground else math.inf
             if now - grounded > _DISARM_AFTER and latest.armed and flight.phase == LANDING:

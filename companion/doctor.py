@@ -44,7 +44,9 @@ _LOOPBACK = ("127.", "localhost", "[::1]")
 Check = Callable[[Settings, Path], Iterator[Finding]]
 
 
-def examine(settings: Settings, root: Path, progress: Callable[[str], None] = lambda what: None) -> list[Finding]:
+def examine(
+    settings: Settings, root: Path, progress: Callable[[str], None] = lambda what: None
+) -> list[Finding]:
     """Every check in turn; `root` is where the system's files are ('/'). `progress` is told what is next."""
     found: list[Finding] = []
     for name, check in CHECKS.items():
@@ -65,11 +67,19 @@ def _machine(settings: Settings, root: Path) -> Iterator[Finding]:
         except importlib.metadata.PackageNotFoundError:
             missing.append(name)
     if missing:
-        yield Finding("packages", f"missing: {', '.join(missing)}", "", 'pip install "trueflight[companion]"', FAIL)
+        yield Finding(
+            "packages", f"missing: {', '.join(missing)}", "", 'pip install "trueflight[companion]"', FAIL
+        )
     available = _number_after("MemAvailable:", root / "proc/meminfo")
     if available is not None:
         state = OK if available > 200e3 else WARN
-        yield Finding("memory", f"{available / 1e3:.0f} MB free", "", "" if state == OK else "stop what is not needed", state)
+        yield Finding(
+            "memory",
+            f"{available / 1e3:.0f} MB free",
+            "",
+            "" if state == OK else "stop what is not needed",
+            state,
+        )
 
 
 def _serial(settings: Settings, root: Path) -> Iterator[Finding]:
@@ -99,12 +109,16 @@ def _serial(settings: Settings, root: Path) -> Iterator[Finding]:
     short = Path(name).name
     aliases = {short, "serial0"} if path.resolve() == (root / "dev/serial0").resolve() else {short}
     words = _text(root / "proc/cmdline").split()
-    consoles = {word.removeprefix("console=").partition(",")[0] for word in words if word.startswith("console=")}
+    consoles = {
+        word.removeprefix("console=").partition(",")[0] for word in words if word.startswith("console=")
+    }
     if consoles & aliases:
         advice = "raspi-config, Interface, Serial: no login shell, hardware on; then restart"
         yield Finding("console", f"the system's console is on {short}", "", advice, FAIL)
     if short == "ttyS0" and "Raspberry Pi" in _text(root / "proc/device-tree/model"):
-        advice = "its clock changes with the processor's; dtoverlay=disable-bt in config.txt, use /dev/ttyAMA0"
+        advice = (
+            "its clock changes with the processor's; dtoverlay=disable-bt in config.txt, use /dev/ttyAMA0"
+        )
         yield Finding("serial port", "ttyS0 is the mini UART", "", advice, WARN)
 
 
@@ -144,7 +158,13 @@ def _clock(settings: Settings, root: Path) -> Iterator[Finding]:
         why = "; the time stamps of mocap poses need it" if needed else "; records are named by it"
         yield Finding("clock", "not kept by NTP", "", advice + why, FAIL if needed else WARN)
     if time.gmtime().tm_year < 2025:
-        yield Finding("clock", time.strftime("%Y-%m-%d", time.gmtime()), "", "no clock chip, no network: set the time", WARN)
+        yield Finding(
+            "clock",
+            time.strftime("%Y-%m-%d", time.gmtime()),
+            "",
+            "no clock chip, no network: set the time",
+            WARN,
+        )
 
 
 def _kept_by_ntp() -> bool | None:
@@ -198,7 +218,9 @@ def _processor(settings: Settings, root: Path) -> Iterator[Finding]:
     if throttled and int(throttled, 16) & 0xF:
         advice = "a better supply (5.1 V, 3 A) or more cooling"
         yield Finding("supply", f"the processor is throttled (0x{throttled})", "", advice, FAIL)
-    hottest = max((int(_text(p) or 0) for p in root.glob("sys/class/thermal/thermal_zone*/temp")), default=0) / 1e3
+    hottest = (
+        max((int(_text(p) or 0) for p in root.glob("sys/class/thermal/thermal_zone*/temp")), default=0) / 1e3
+    )
     if hottest > _HOT:
         yield Finding("temperature", f"{hottest:.0f} degrees", "", "a cooler, or less to do", WARN)
     late = 0.0
@@ -230,7 +252,9 @@ def _zenoh(settings: Settings, root: Path) -> Iterator[Finding]:
         host, port = found.group(1), int(found.group(2))
         problem = _cannot_listen(host, port)
         if problem:
-            advice = "another companion is running (systemctl status trueflight-companion), or choose another port"
+            advice = (
+                "another companion is running (systemctl status trueflight-companion), or choose another port"
+            )
             yield Finding("Zenoh", f"{end}: {problem}", "", advice, WARN)
         elif host.startswith(_LOOPBACK):
             advice = f"only this machine can reach it; for the ground listen on tcp/0.0.0.0:{port}"

@@ -46,7 +46,8 @@ class Safety:
     The fence is a cylinder around home: `fence_radius`, `fence_height` in m. `takeoff_voltage` and
     `land_voltage` are shares of the nominal voltage; the latter ends a flight when it lasts
     `battery_patience` s. `odometry_gap` s of the vehicle's clock without odometry end a flight, as do a jump
-    of the position by `jump` m between two messages and a distance of `lost` m from the reference.
+    of the position by `jump` m between two messages, a distance of `lost` m from the reference and an estimator that
+    knows its horizontal position to no better than `position_accuracy` m.
     `climb_speed` and `transfer_speed` in m/s.
     """
 
@@ -58,6 +59,7 @@ class Safety:
     odometry_gap: float = 0.25
     jump: float = 1.0
     lost: float = 4.0
+    position_accuracy: float = 2.0
     climb_speed: float = 0.8
     transfer_speed: float = 1.5
 
@@ -439,7 +441,9 @@ class Flight:
             if self.wants_land and latest.flight_mode == "LAND":
                 return
             if latest.failsafe:
-                text = f"{latest.flight_mode} was chosen by the autopilot's failsafe{_because(latest)}: silent"
+                text = (
+                    f"{latest.flight_mode} was chosen by the autopilot's failsafe{_because(latest)}: silent"
+                )
                 self._silence("failsafe", text)
             else:
                 who = f"the pilot or a ground station{_because(latest)}"

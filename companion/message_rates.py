@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from companion.vehicle_link import Rates
 
-_ONBOARD_RATE = 80_000  # bytes/s: odometry and accelerometer for 100 Hz of control beside an onboard link's other streams
+_ONBOARD_RATE = (
+    80_000  # bytes/s: odometry and accelerometer for 100 Hz of control beside an onboard link's other streams
+)
 
 
 def odometry_too_low(rates: Rates, wanted: float, share: float = 0.75) -> str:
@@ -13,7 +15,7 @@ def odometry_too_low(rates: Rates, wanted: float, share: float = 0.75) -> str:
         return ""
     told = f"odometry arrives at {rates.odometry:.0f} Hz, {wanted:.0f} Hz were asked for"
     if rates.odometry == 0.0:
-        return f"{told}: the estimator has no position yet, or the link carries no ODOMETRY (PX4: MAV_x_MODE 2, Onboard)"
+        return f"{told}: set the link's MAV_x_MODE to 2 (Onboard) in PX4; its estimator may still be starting"
     period = int(1e6 / wanted) // 1000 * 1000 or 1000
     estimator = f"EKF2_PREDICT_US to {period} and restart it, or " if wanted > 100.0 else ""
     return (

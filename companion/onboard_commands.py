@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -15,6 +15,12 @@ from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn
 
 from models.errors import InputError
+
+if TYPE_CHECKING:
+    from companion.pose import PoseFeed
+    from companion.settings import Settings
+    from companion.vehicle_link import VehicleLink
+    from models.vehicle import Vehicle
 
 console = Console()
 _FAILED = 2
@@ -75,13 +81,13 @@ def preflight_command(
     link = VehicleLink(settings.connect, settings.timeout)
     changed: list[str] = []
     try:
-        with _progress(as_json) as tell:
-            report = preflight.look(link, settings, believed, tell)
+        with _progress(as_json) as tell, _poses(settings, believed, link) as pose:
+            report = preflight.look(link, settings, believed, tell, pose)
             if set_parameters:
                 tell("setting parameters")
                 changed = preflight.set_parameters(link, [*report.parameters, *report.hover])
                 if changed:
-                    report = preflight.look(link, settings, believed, tell)
+                    report = preflight.look(link, settings, believed, tell, pose)
     finally:
         link.close()
     if as_json:
@@ -97,7 +103,9 @@ def preflight_command(
         open_changes = [p.name for p in (*report.parameters, *report.hover) if p.change is not None]
         if open_changes and not set_parameters:
             console.print(f"--set-params would set: {', '.join(open_changes)}")
-        console.print("[green]ready for a flight[/]" if report.ready else "[bold red]not ready for a flight[/]")
+        console.print(
+            "[green]ready for a flight[/]" if report.ready else "[bold red]not ready for a flight[/]"
+        )
     raise typer.Exit(0 if report.ready else _FAILED)
 
 
@@ -126,7 +134,11 @@ def doctor_command(
         typer.echo(json.dumps({"ready": not failed, "findings": rows_of(findings)}))
     else:
         console.print(table_of("This machine", findings, "what to do"))
-        told = f"[bold red]{len(failed)} to mend before a flight[/]" if failed else "[green]nothing against a flight[/]"
+        told = (
+            f"[bold red]{len(failed)} to mend before a flight[/]"
+            if failed
+            else "[green]nothing against a flight[/]"
+        )
         console.print(told)
     raise typer.Exit(_FAILED if failed else 0)
 
@@ -142,7 +154,9 @@ def install_command(
     listen: Annotated[str, typer.Option(help="Zenoh endpoint for the ground.")] = "tcp/0.0.0.0:7447",
     user: Annotated[str, typer.Option(help="User that the companion runs as.")] = "trueflight",
     realtime: Annotated[int, typer.Option(help="Priority of the control thread, 0 for none.")] = 20,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Root that the files are put below.")] = Path("/"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="Root that the files are put below.")] = Path(
+        "/"
+    ),
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the files and write nothing.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -179,7 +193,7 @@ def _settings(
     rate: float | None,
     timeout: float | None,
     records: Path | None,
-) -> Any:
+) -> Settings:
     from companion.settings import load_settings
 
     settings = load_settings(config)
@@ -191,6 +205,32 @@ def _settings(
         raise InputError(f"rate = {settings.rate:g} is outside 10 to 1000 Hz")
     settings.pose.checked()
     return settings
+
+
+@contextmanager
+def _poses(settings: Settings, vehicle: Vehicle | None, link: VehicleLink) -> Iterator[PoseFeed | None]:
+    """Mocap poses passed on meanwhile, where the configuration wants them: the estimator has no position without."""
+    if not settings.pose.enabled:
+        yield None
+        return
+    if vehicle is None:
+        raise InputError("[pose] is enabled: pass --vehicle, whose name is in the key of the poses")
+    from companion.pose import PoseFeed
+    from companion.zenoh_session import open_session
+    from models.contract import key
+
+    session = open_session(settings.zenoh)
+    feed = PoseFeed(settings.pose, link.send_pose, lambda level, kind, text: None)
+    try:
+        link.share_clock()
+        subscriber = session.declare_subscriber(
+            key(vehicle.name, "pose"), lambda sample: feed.take(sample.payload.to_bytes())
+        )
+        yield feed
+        subscriber.undeclare()
+    finally:
+        feed.close()
+        session.close()
 
 
 @contextmanager

@@ -187,7 +187,11 @@ class PoseFeed:
         """How it is going, for JSON: rate (Hz), latencies (ms: taken to sent, arrived to sent), what was refused."""
         times, ages, handling = list(self._times), sorted(self._ages), sorted(self._handling)
         recent = [t for t in times if t > time.monotonic() - 2.0]
-        rate = (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 and recent[-1] > recent[0] else 0.0
+        rate = (
+            (len(recent) - 1) / (recent[-1] - recent[0])
+            if len(recent) > 1 and recent[-1] > recent[0]
+            else 0.0
+        )
         return {
             "rate": round(rate, 1),
             "passed": self._passed,

@@ -17,6 +17,7 @@ import numpy as np
 
 from companion.findings import FAIL, NOTE, OK, WARN, Finding, rows_of
 from companion.message_rates import link_too_slow, odometry_too_low
+from companion.pose import PoseFeed
 from companion.px4_events import ERROR
 from companion.settings import Settings
 from companion.vehicle_link import Rates, VehicleLink
@@ -29,6 +30,8 @@ Number = int | float
 _SLOW, _TILT = 0.2, 0.1
 """m/s and rad below which a recorded sample counts as hover."""
 _HOVER_SECONDS = 2.0
+_FUSED_WITHIN = 20.0  # s in which PX4's estimator takes poses up, or never does
+_POSE_RATE = 30.0  # Hz that PX4 asks of external vision at least
 _PATIENCE = 5.0  # s for a first heartbeat
 _HOVER_HEIGHT = 0.5  # m, out of ground effect
 _HOVER_NEAR, _HOVER_FAR = 0.10, 0.30
@@ -217,15 +220,19 @@ def look(
     settings: Settings,
     vehicle: Vehicle | None,
     progress: Callable[[str], None] = lambda what: None,
+    pose: PoseFeed | None = None,
 ) -> Preflight:
     """Ask everything of the autopilot; takes some seconds, longer for every parameter that it does not have.
 
-    `progress` is told what is being looked at. The vehicle must be disarmed: raises `InputError` otherwise.
+    With a `pose` feed it waits until the estimator has made a position of it. `progress` is told what is being
+    looked at. The vehicle must be disarmed: raises `InputError` otherwise.
     """
     end = time.monotonic() + _PATIENCE
     while link.latest.heartbeat == -math.inf:  # until the first one every state is only a default
         if time.monotonic() > end:
-            raise InputError(f"{link.address}: no heartbeat of the autopilot's own; is the link a one-way one?")
+            raise InputError(
+                f"{link.address}: no heartbeat of the autopilot's own; is the link a one-way one?"
+            )
         time.sleep(0.02)
     if link.latest.armed:
         raise InputError("the vehicle is armed; disarm it, then look again")
@@ -233,6 +240,13 @@ def look(
     link.request_rates(settings.rate)
     time.sleep(0.5)
     rates = link.measure(2.0)
+    if pose is not None:
+        progress("mocap poses")
+        end = time.monotonic() + _FUSED_WITHIN
+        while (pose.why_not or link.latest.position_accuracy > settings.safety.position_accuracy) and (
+            time.monotonic() < (end if pose.status()["passed"] else end - 0.5 * _FUSED_WITHIN)
+        ):
+            time.sleep(0.1)
     progress("arming checks")
     arming = tuple(_arming(link, settings, vehicle))
     parameters = []
@@ -246,7 +260,7 @@ def look(
         link.autopilot_version(),
         arming,
         tuple(parameters),
-        tuple(_rates(link, settings, rates)),
+        (*_rates(link, settings, rates), *_poses(pose)),
         tuple(hover),
     )
 
@@ -285,12 +299,35 @@ def _arming(link: VehicleLink, settings: Settings, vehicle: Vehicle | None) -> I
             yield Finding("arming", problem.text, "", problem.advice, state)
         if not report.reasons(streaming=False):
             yield Finding("arming", "PX4 would arm", "", "once the companion streams setpoints", OK)
+    accuracy = link.latest.position_accuracy
+    if accuracy > 0.0:
+        good = accuracy <= settings.safety.position_accuracy
+        told = f"known to {accuracy:.2f} m" if math.isfinite(accuracy) else "none"
+        why = f"a flight needs {settings.safety.position_accuracy:g} m; PX4 itself would arm for Offboard without"
+        yield Finding("position", told, "", why, OK if good else FAIL)
     voltage = link.latest.battery_voltage
     if vehicle is not None:
         low = settings.safety.takeoff_voltage * vehicle.nominal_voltage
         state = NOTE if voltage == 0.0 else OK if voltage >= low else FAIL
         told = f"{voltage:.1f} V" if voltage else "not told"
         yield Finding("battery", told, "", f"a flight needs {low:.1f} V ([safety] takeoff_voltage)", state)
+
+
+def _poses(feed: PoseFeed | None) -> Iterator[Finding]:
+    if feed is None:
+        return
+    status, name = feed.status(), "mocap poses"
+    if feed.why_not:
+        why = f"{feed.why_not}; put them on the key trueflight/<vehicle>/pose"
+        yield Finding(name, "none", "", why, FAIL)
+        return
+    latency = status["latency_ms"]
+    late = f"{latency['median']:.1f} ms old when passed on, p99 {latency['p99']:.1f} ms"
+    state = OK if status["rate"] >= _POSE_RATE else WARN
+    yield Finding(name, f"{status['rate']:.0f} Hz", f"{_POSE_RATE:.0f} Hz", late, state)
+    if status["refused"]:
+        told = ", ".join(f"{count} {kind}" for kind, count in status["refused"].items())
+        yield Finding("poses refused", told, "0", "stale, jumping or no pose at all", WARN)
 
 
 def _parameter(link: VehicleLink, wish: Wish) -> Parameter:
@@ -321,7 +358,9 @@ def _rates(link: VehicleLink, settings: Settings, rates: Rates) -> Iterator[Find
     state = OK if rates.battery > 1.0 else WARN
     why = "voltage, for the battery limits and for battery_sag"
     yield Finding("battery", f"{rates.battery:.0f} Hz", "1 Hz", why, state)
-    why = "rotor speeds; without them some effects cannot be told apart" + ("" if rates.esc else " (DShot telemetry)")
+    why = "rotor speeds; without them some effects cannot be told apart" + (
+        "" if rates.esc else " (DShot telemetry)"
+    )
     yield Finding("rotor speeds", f"{rates.esc:.0f} Hz", "any", why, OK if rates.esc else NOTE)
 
 
@@ -356,7 +395,9 @@ def hover_of(ticks: dict[str, np.ndarray], name: str) -> Hover | None:
         return None
     speed = np.linalg.norm(ticks["velocity"], axis=1)
     _, x, y, _ = ticks["quaternion"].T
-    still = ticks["setpoint_sent"] & ticks["armed"] & (speed < _SLOW) & (ticks["position"][:, 2] > _HOVER_HEIGHT)
+    still = (
+        ticks["setpoint_sent"] & ticks["armed"] & (speed < _SLOW) & (ticks["position"][:, 2] > _HOVER_HEIGHT)
+    )
     still &= 2.0 * (x * x + y * y) < 1.0 - math.cos(_TILT)
     seconds = float(np.sum(ticks["interval"][still]))
     if seconds < _HOVER_SECONDS:
@@ -377,7 +418,9 @@ def _hover(link: VehicleLink, vehicle: Vehicle | None, records: Path) -> Iterato
         away = learned.thrust / ours - 1.0
         state = FAIL if abs(away) > _HOVER_FAR else WARN if abs(away) > _HOVER_NEAR else OK
         where = f"flown: {learned.seconds:.0f} s of hover at {learned.voltage:.1f} V"
-        yield Parameter("hover_thrust, flown", f"{learned.thrust:.3f}", f"{ours:g} (vehicle file)", where, state)
+        yield Parameter(
+            "hover_thrust, flown", f"{learned.thrust:.3f}", f"{ours:g} (vehicle file)", where, state
+        )
     best = learned.thrust if learned is not None else ours
     if theirs is None:
         yield Parameter("MPC_THR_HOVER", shown, f"{best:.2f}", "", NOTE)

@@ -101,9 +101,18 @@ CHECKS: dict[str, tuple[str, str]] = {
     ),
     "check_modes_mission": ("no mission on board", "not needed for Offboard"),
     "check_estimator_missing_data": ("the estimator is still starting", "wait some seconds"),
-    "check_estimator_hor_pos_not_stable": ("horizontal position is unsteady", "wait, or improve GPS or mocap"),
-    "check_estimator_hor_vel_not_stable": ("horizontal velocity is unsteady", "keep the vehicle still and wait"),
-    "check_estimator_vert_vel_not_stable": ("vertical velocity is unsteady", "keep the vehicle still and wait"),
+    "check_estimator_hor_pos_not_stable": (
+        "horizontal position is unsteady",
+        "wait, or improve GPS or mocap",
+    ),
+    "check_estimator_hor_vel_not_stable": (
+        "horizontal velocity is unsteady",
+        "keep the vehicle still and wait",
+    ),
+    "check_estimator_vert_vel_not_stable": (
+        "vertical velocity is unsteady",
+        "keep the vehicle still and wait",
+    ),
     "check_estimator_hgt_not_stable": ("height is unsteady", "wait; check barometer and EKF2_HGT_REF"),
     "check_estimator_heading_not_stable": (
         "heading is unsteady",
@@ -138,10 +147,16 @@ CHECKS: dict[str, tuple[str, str]] = {
     "check_mag_not_calibrated": ("the compass is not calibrated", "calibrate it in QGroundControl"),
     "check_mag_fault": ("the compass is faulty", "move away from metal; calibrate it"),
     "check_mag_consistency": ("two compasses disagree", "move away from metal; calibrate them"),
-    "check_mag_sys_has_mag_missing": ("fewer compasses than SYS_HAS_MAG says", "connect it, or lower SYS_HAS_MAG"),
+    "check_mag_sys_has_mag_missing": (
+        "fewer compasses than SYS_HAS_MAG says",
+        "connect it, or lower SYS_HAS_MAG",
+    ),
     "check_baro_missing": ("the barometer is missing", "reboot, or set SYS_HAS_BARO 0 with another height"),
     "check_baro_no_data": ("the barometer gives nothing", "reboot; then look for a fault"),
-    "check_distance_sensor_missing": ("the distance sensor is missing", "connect it, or lower SYS_HAS_NUM_DIST"),
+    "check_distance_sensor_missing": (
+        "the distance sensor is missing",
+        "connect it, or lower SYS_HAS_NUM_DIST",
+    ),
     "check_optical_sensor_missing": ("the flow sensor is missing", "connect it, or set SYS_HAS_NUM_OF 0"),
     "check_battery_missing": ("a battery is missing", "connect it, and its power module"),
     "check_battery_disconnected": ("a battery is disconnected", "connect it"),
@@ -161,7 +176,10 @@ CHECKS: dict[str, tuple[str, str]] = {
     "check_system_usb_connected": ("USB is connected", "take the cable off before flying"),
     "check_system_safety_button": ("the safety switch is on", "press it until it stops blinking"),
     "check_system_flight_term_active": ("flight is terminated", "find out why, then reboot the autopilot"),
-    "check_system_arm_auth_failed": ("arming was not authorised", "ask whoever has the authority (COM_ARM_AUTH)"),
+    "check_system_arm_auth_failed": (
+        "arming was not authorised",
+        "ask whoever has the authority (COM_ARM_AUTH)",
+    ),
     "check_system_no_home_pos": ("no home position", "wait for GPS, or lower COM_ARM_WO_GPS"),
     "check_system_no_global_pos": ("no global position", "wait for GPS, or set COM_ARM_WO_GPS 1"),
     "check_armable_configuration": ("arming is switched off", "set COM_ARMABLE 1"),
@@ -179,7 +197,10 @@ CHECKS: dict[str, tuple[str, str]] = {
     "check_failure_detector_pitch": ("tilted too far in pitch", "put the vehicle level (FD_FAIL_P)"),
     "check_failure_detector_alt": ("the height failed", "find out why before another flight"),
     "check_failure_detector_imbalanced_prop": ("a propeller is unbalanced", "change it"),
-    "check_gf_violation_custom_gf": ("outside the autopilot's geofence", "bring it inside, or change the fence"),
+    "check_gf_violation_custom_gf": (
+        "outside the autopilot's geofence",
+        "bring it inside, or change the fence",
+    ),
     "check_gf_violation_max_alt": ("above the autopilot's geofence", "GF_MAX_VER_DIST"),
     "check_gf_violation_max_hor_dist": ("beyond the autopilot's geofence", "GF_MAX_HOR_DIST"),
     "check_gf_violation": ("outside the autopilot's geofence", "bring it inside, or change the fence"),
@@ -206,8 +227,19 @@ CHECKS: dict[str, tuple[str, str]] = {
 _NAMES = {event_number(name): name for name in CHECKS}
 _ARMING_SUMMARY = event_number("commander_arming_check_summary")
 _HEALTH_SUMMARY = event_number("commander_health_summary")
-_ACTIONS = ("none", "warning", "Position", "Altitude", "Stabilized", "Hold", "Return", "Land", "Descend")
-_ACTIONS += ("disarm", "terminate")
+_ACTIONS = (
+    "none",
+    "warning",
+    "Position",
+    "Altitude",
+    "Stabilized",
+    "Hold",
+    "Return",
+    "Land",
+    "Descend",
+    "disarm",
+    "terminate",
+)
 _CAUSES = (
     "a failed check",
     "radio control lost",
@@ -242,7 +274,12 @@ def describe(event: Px4Event) -> str:
     return CHECKS[name][0]
 
 
-_TOLD_ANYWAY = ("failsafe_rc_override", "commander_rc_override", "commander_rc_lost", "commander_kill_sw_engaged")
+_TOLD_ANYWAY = (
+    "failsafe_rc_override",
+    "commander_rc_override",
+    "commander_rc_lost",
+    "commander_kill_sw_engaged",
+)
 
 
 def _name_of(names: Sequence[str], arguments: bytes, at: int | None) -> str:

@@ -50,14 +50,18 @@ class Service:
         if not _NAME.fullmatch(self.user):
             raise InputError(f"--user '{self.user}' is no name of a user; small letters, digits, - and _")
         if self.user == "root":
-            raise InputError("--user root: the companion needs no such rights; leave it, or name another user")
+            raise InputError(
+                "--user root: the companion needs no such rights; leave it, or name another user"
+            )
         if not 0 <= self.realtime <= 80:
             raise InputError(f"--realtime {self.realtime} is outside 0 (off) to 80")
         if not re.fullmatch(r"[\x21-\x7e]+", self.connect):
             raise InputError(f"--connect '{self.connect}' holds blanks or control characters")
         load_vehicle(self.vehicle)
         if not self.design.is_file():
-            raise InputError(f"{self.design}: no design file; make it with groundstation design, or pass --design")
+            raise InputError(
+                f"{self.design}: no design file; make it with groundstation design, or pass --design"
+            )
         return self
 
     @property
@@ -131,9 +135,9 @@ def _configured(values: dict[str, str]) -> str:
     """The commented example with these values; comments stay where they are."""
     text = Path(__file__).with_name("companion.toml").read_text(encoding="utf-8")
     for key, value in values.items():
-        text, count = re.subn(
-            rf"^(?:# )?{key} = [^#\n]*", lambda _: f"{key} = {value} ".ljust(38), text, count=1, flags=re.MULTILINE
-        )
+        line = f"{key} = {value} ".ljust(38)
+        pattern = rf"^(?:# )?{key} = [^#\n]*"
+        text, count = re.subn(pattern, line.replace("\\", r"\\"), text, count=1, flags=re.MULTILINE)
         assert count == 1, key
     return re.sub(r"[ ]+$", "", text, flags=re.MULTILINE)
 
@@ -168,7 +172,9 @@ def _put(path: Path, text: bytes, dry_run: bool, marked: bool) -> str:
             part.replace(target)
         return state
     except OSError as error:
-        raise InputError(f"{path}: cannot write it ({error.strerror}); use sudo, or --output FOLDER") from None
+        raise InputError(
+            f"{path}: cannot write it ({error.strerror}); use sudo, or --output FOLDER"
+        ) from None
 
 
 def _untouched(there: bytes) -> bool:

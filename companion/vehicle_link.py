@@ -57,6 +57,7 @@ _MESSAGE_IDS = {
     "HEARTBEAT": 0,
     "AUTOPILOT_VERSION": 148,
     "TIMESYNC": 111,
+    "ESTIMATOR_STATUS": 230,
 }
 _SET_MESSAGE_INTERVAL, _DO_SET_MODE, _ARM_DISARM = 511, 176, 400
 _RUN_PREARM_CHECKS, _REQUEST_MESSAGE = 401, 512
@@ -71,6 +72,7 @@ _RESULTS = {
 }
 _ARMED = 128
 _CRITICAL, _TERMINATED = 5, 8  # MAV_STATE of a failsafe that acts, and of motors that are cut
+_POSITION, _HELD = 8 | 16, 128  # ESTIMATOR_POS_HORIZ_REL or _ABS; ESTIMATOR_CONST_POS_MODE
 _GROUND_STATION_HEARTBEAT = (
     '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
 )
@@ -120,7 +122,8 @@ class Latest:
     yet read: it arrives just before the odometry, and what it takes to read it would delay the setpoint.
     `killed` while the motors are cut (kill switch, termination), `failsafe` where the mode is one that the
     autopilot's failsafe chose, `unhealthy` what SYS_STATUS says is not well, `notices` what it told of failsafes,
-    switches and failed checks (monotonic s, text).
+    switches and failed checks (monotonic s, text). `position_accuracy` is the estimator's own horizontal one, m:
+    infinite where it says that it has no position, 0 where it says nothing. PX4 sends odometry either way.
     """
 
     battery_voltage: float = 0.0
@@ -134,6 +137,7 @@ class Latest:
     killed: bool = False
     failsafe: bool = False
     unhealthy: tuple[str, ...] = ()
+    position_accuracy: float = 0.0
     notices: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=4))
 
     @property
@@ -230,6 +234,7 @@ class VehicleLink:
             ("STATUSTEXT", self._text),
             ("EVENT", self._event),
             ("SYS_STATUS", self._system_status),
+            ("ESTIMATOR_STATUS", self._estimator),
             ("AUTOPILOT_VERSION", self._autopilot_version),
         ):
             self._direct.subscribe_message(name, self._safe(handler))
@@ -305,6 +310,7 @@ class VehicleLink:
             "ESC_STATUS": min(rate, 100.0),
             "EXTENDED_SYS_STATE": 5.0,
             "CURRENT_MODE": 10.0,
+            "ESTIMATOR_STATUS": 5.0,
             "HEARTBEAT": 10.0,  # a pilot who takes over is heard within 0.1 s instead of 1 s
         }
         for name, wish in wishes.items():
@@ -508,6 +514,9 @@ class VehicleLink:
             )
         )
 
+    def _estimator(self, fields: dict[str, Any]) -> None:
+        self.latest.position_accuracy = position_accuracy(fields)
+
     def _system_status(self, fields: dict[str, Any]) -> None:
         enabled = int(fields["onboard_control_sensors_enabled"])
         self.latest.unhealthy = unhealthy(enabled, int(fields["onboard_control_sensors_health"]))
@@ -522,7 +531,9 @@ def vision_estimate(pose: Pose, taken_us: int, reset_counter: int) -> VisionPosi
     if math.isfinite(pose.position_std) and math.isfinite(pose.attitude_std):
         # The upper right triangle, row by row, of x, y, z, roll, pitch, yaw.
         covariance = [0.0] * 21
-        for i, std in zip((0, 6, 11, 15, 18, 20), (pose.position_std,) * 3 + (pose.attitude_std,) * 3, strict=True):
+        for i, std in zip(
+            (0, 6, 11, 15, 18, 20), (pose.position_std,) * 3 + (pose.attitude_std,) * 3, strict=True
+        ):
             covariance[i] = std * std
     return VisionPositionEstimate(
         taken_us,
@@ -548,6 +559,14 @@ def mode_name(custom_mode: int) -> str:
     """PX4's flight mode of a heartbeat, as MAVSDK names it."""
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
     return _MODES.get((main, sub), _MODES.get((main, 0), "UNKNOWN"))
+
+
+def position_accuracy(fields: dict[str, Any]) -> float:
+    """Horizontal accuracy (m) that an ESTIMATOR_STATUS tells; infinite where the estimator has no position."""
+    flags, accuracy = int(fields["flags"]), fields["pos_horiz_accuracy"]
+    if not flags & _POSITION or flags & _HELD or accuracy is None or not math.isfinite(accuracy):
+        return math.inf
+    return float(accuracy)
 
 
 def odometry_from_wire(fields: dict[str, Any]) -> Odometry | None:

@@ -64,7 +64,9 @@ def pose_from_json(payload: bytes) -> Pose:
     time_ns = table.get("time_ns", 0)
     if type(time_ns) is not int or time_ns < 0:
         raise ValueError("its 'time_ns' is no whole number of nanoseconds since 1970")
-    spread = [_numbers(name, [table.get(name, math.nan)], 1, True)[0] for name in ("position_std", "attitude_std")]
+    spread = [
+        _numbers(name, [table.get(name, math.nan)], 1, True)[0] for name in ("position_std", "attitude_std")
+    ]
     x, y, z, *turned = numbers
     w, i, j, k = (q / math.sqrt(size) for q in turned)
     return Pose((x, y, z), (w, i, j, k), time_ns, *spread)

@@ -349,7 +349,9 @@ class Autopilot:
         outside = 0.0 < across < math.hypot(x, y) or 0.0 < up < z
         if outside and self.failsafe != "geofence":
             self.events.append(("check_gf_violation", 3, struct.pack("<IB", 0xFFFFFFFF, 0)))
-            self._fail("geofence", {2: Mode.HOLD, 3: Mode.RTL, 5: Mode.LAND}.get(int(parameters["GF_ACTION"])), 0)
+            self._fail(
+                "geofence", {2: Mode.HOLD, 3: Mode.RTL, 5: Mode.LAND}.get(int(parameters["GF_ACTION"])), 0
+            )
         charge = self.simulator.airframe.battery.charge
         critical = charge < parameters["BAT_CRIT_THR"]
         if critical and self.failsafe != "battery":

@@ -41,11 +41,17 @@ def arming_report(refusals: Sequence[str], offboard_alive: bool) -> list[tuple[s
     """Name, level and arguments of the events that tell the arming checks, as PX4 sends them after
     MAV_CMD_RUN_PREARM_CHECKS: `offboard_alive` False stands against Offboard alone.
     """
-    problems = [(_CHECKS[text], _ERROR, struct.pack("<IB", _ALL_GROUPS, 0)) for text in refusals if text in _CHECKS]
+    problems = [
+        (_CHECKS[text], _ERROR, struct.pack("<IB", _ALL_GROUPS, 0)) for text in refusals if text in _CHECKS
+    ]
     if not offboard_alive and "no offboard signal" not in refusals:
         problems.append((_CHECKS["no offboard signal"], _ERROR, struct.pack("<IB", _OFFBOARD_GROUP, 0)))
     can_arm = _ALL_GROUPS if not problems else 0
-    first = ("commander_arming_check_summary", _PROTOCOL, struct.pack("<BIIII", 0, 0, 0, can_arm, _ALL_GROUPS))
+    first = (
+        "commander_arming_check_summary",
+        _PROTOCOL,
+        struct.pack("<BIIII", 0, 0, 0, can_arm, _ALL_GROUPS),
+    )
     last = ("commander_health_summary", _PROTOCOL, struct.pack("<BIII", 0, 0, 0, 0))
     return [first, *problems, last]
 
@@ -69,7 +75,15 @@ class Event(mav.MAVLink_message):
 
     def __init__(self, name: str, level: int, arguments: bytes, time_ms: int, sequence: int) -> None:
         mav.MAVLink_message.__init__(self, self.id, self.msgname)
-        self._values = (number_of(name), time_ms % 2**32, sequence % 2**16, 0, 0, level << 4 | level, arguments)
+        self._values = (
+            number_of(name),
+            time_ms % 2**32,
+            sequence % 2**16,
+            0,
+            0,
+            level << 4 | level,
+            arguments,
+        )
 
     def pack(self, link: Any, force_mavlink1: bool = False) -> bytes:
         """The message's bytes for a link."""

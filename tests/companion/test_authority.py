@@ -87,7 +87,9 @@ def test_the_kill_switch_ends_the_flight_and_what_was_queued(tap: Wiretap, tmp_p
         assert refused["state"] == "failed"
         assert "the kill switch is on; flip it back" in refused["reason"]
         assert not tap.armed
-        assert len(tap.times[SET_ATTITUDE_TARGET]) > sent, "it streamed, which PX4 wants to hear before it arms"
+        assert len(tap.times[SET_ATTITUDE_TARGET]) > sent, (
+            "it streamed, which PX4 wants to hear before it arms"
+        )
     finally:
         companion.end()
         bridge.end()

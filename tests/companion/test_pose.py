@@ -55,7 +55,9 @@ class TestFrames:
         assert (estimate.time_usec, estimate.reset_counter) == (7, 3)
 
     def test_nose_to_the_east_is_ninety_degrees_from_north(self) -> None:
-        assert vision_estimate(Pose((0, 0, 0), LEVEL), 0, 0).angle_body.yaw_rad == pytest.approx(0.5 * math.pi)
+        assert vision_estimate(Pose((0, 0, 0), LEVEL), 0, 0).angle_body.yaw_rad == pytest.approx(
+            0.5 * math.pi
+        )
 
     def test_what_is_unknown_is_told_as_unknown(self) -> None:
         (only,) = vision_estimate(Pose((0, 0, 0), LEVEL), 0, 0).pose_covariance.covariance_matrix
@@ -228,7 +230,9 @@ def test_from_zenoh_to_the_wire_and_a_lost_feed_lands(tmp_path: Path) -> None:
         before = len(tap.poses)
         publisher.put(json.dumps({"position": [1.0, 2.0, None], "quaternion": [1, 0, 0, 0]}))
         put((9.0, 2.0, 0.5))
-        wait_for(lambda: companion.ask("status")["pose"]["refused"] == {"malformed": 1, "jump": 1}, "refusals")
+        wait_for(
+            lambda: companion.ask("status")["pose"]["refused"] == {"malformed": 1, "jump": 1}, "refusals"
+        )
         assert len(tap.poses) <= before + 1
         sent = decoded(tap.poses)
         first = sent[0]

@@ -42,7 +42,9 @@ def rows(report: dict[str, Any], part: str) -> dict[str, dict[str, Any]]:
     return {row["name"]: row for row in report[part]}
 
 
-def test_parameters_are_reported_and_changed_only_when_asked(bridge: tuple[Bridge, int], tmp_path: Path) -> None:
+def test_parameters_are_reported_and_changed_only_when_asked(
+    bridge: tuple[Bridge, int], tmp_path: Path
+) -> None:
     port = bridge[1]
     for _ in range(2):  # looking changes nothing
         code, report = look(port, "--records", tmp_path)
@@ -60,7 +62,9 @@ def test_parameters_are_reported_and_changed_only_when_asked(bridge: tuple[Bridg
     assert any(line.startswith("COM_OBL_RC_ACT: 0 -> 4") for line in report["changed"])
     # The stand-in, like PX4, refuses an INT32 that is sent as a float and the other way round: both kinds took.
     found = rows(report, "parameters")
-    assert {name: row["value"] for name, row in found.items() if name in ("COM_RC_OVERRIDE", "GF_MAX_HOR_DIST")} == {
+    assert {
+        name: row["value"] for name, row in found.items() if name in ("COM_RC_OVERRIDE", "GF_MAX_HOR_DIST")
+    } == {
         "COM_RC_OVERRIDE": "3",
         "GF_MAX_HOR_DIST": "15",
     }

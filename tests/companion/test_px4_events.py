@@ -71,7 +71,12 @@ def test_an_unknown_check_is_told_with_its_number() -> None:
     [
         ("commander_failsafe_enter", 2, (0, 0, 6, 0, 7, 4), "failsafe: battery critical, Land"),
         ("commander_failsafe_enter_generic", 2, (0, 0, 6, 0, 5), "failsafe: a failed check, Hold"),
-        ("commander_failsafe_enter_hold", 2, (0, 0, 6, 0, 6, 5, 0, 1), "failsafe: radio control lost, Return"),
+        (
+            "commander_failsafe_enter_hold",
+            2,
+            (0, 0, 6, 0, 6, 5, 0, 1),
+            "failsafe: radio control lost, Return",
+        ),
         ("commander_failsafe_enter_warn", 4, (0, 0, 6, 0, 2), "failsafe: ground station lost, warning"),
         ("commander_failsafe_enter", 2, (0, 0, 6, 0, 200, 200), "failsafe: a failed check, warning"),
         ("commander_failsafe_enter", 2, (), "failsafe: a failed check, warning"),

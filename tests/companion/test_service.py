@@ -54,7 +54,9 @@ def test_the_unit_restarts_watches_and_has_a_user_of_its_own(tmp_path: Path) -> 
     assert service["User"] == "pilot"
     assert service["LimitRTPRIO"] == "15"
     assert service["ExecStart"].endswith(f"run --config /{CONFIG}")
-    assert unit["Unit"]["StartLimitIntervalSec"] == "0", "it never gives up on a vehicle that is switched on later"
+    assert unit["Unit"]["StartLimitIntervalSec"] == "0", (
+        "it never gives up on a vehicle that is switched on later"
+    )
     assert "u pilot" in (tmp_path / SYSUSERS).read_text()
 
 
