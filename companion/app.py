@@ -106,6 +106,7 @@ class Companion:
             self.emit("warning", "model_refused", f"no longer accepted: {reason}")
         self.link.on_odometry = self._control
         self.link.on_error = self._wire_error
+        self.link.on_blind = self.watchdog.tick  # nothing to control by, but the control thread is well
         self.link.on_notice = self._autopilot_tells
         try:
             self._settle_rates(settings.rate)

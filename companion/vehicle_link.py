@@ -180,13 +180,15 @@ class VehicleLink:
 
     Raises `InputError` where the address cannot be used or nobody answers within `timeout` s. `on_odometry`
     is called with each odometry message on the control thread; what it raises ends up in `on_error` and sends
-    nothing. `on_notice` gets what the autopilot tells of failsafes, switches and failed checks, in plain words.
+    nothing; `on_blind` takes its place for a message without an estimate. `on_notice` gets what the autopilot
+    tells of failsafes, switches and failed checks, in plain words.
     """
 
     def __init__(self, address: str = "udpin://127.0.0.1:14540", timeout: float = 10.0) -> None:
         self.address = address
         self.latest = Latest()
         self.on_odometry: Callable[[Odometry], None] = lambda odometry: None
+        self.on_blind: Callable[[], None] = lambda: None
         self.on_state: Callable[[], None] = lambda: None
         self.on_error: Callable[[str], None] = lambda text: None
         self.on_notice: Callable[[str], None] = lambda text: None
@@ -439,6 +441,8 @@ class VehicleLink:
         odometry = odometry_from_wire(fields)
         if odometry is not None:
             self.on_odometry(odometry)
+        else:
+            self.on_blind()
 
     def _imu(self, message: MavlinkMessage, _: Any) -> None:
         self._counts["HIGHRES_IMU"] += 1
