@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from models.network import Network
 
 if TYPE_CHECKING:
     from groundstation.analysis import Analysis
+    from groundstation.calibration import Calibration, Case
     from groundstation.side_by_side import SideBySide
     from groundstation.tracking import Tracking
 
@@ -225,3 +227,25 @@ def analysis_table(a: Analysis) -> dict[str, Any]:
         "provenance": asdict(a.provenance),
     }
     return plain(table)
+
+
+def calibration_table(calibration: Calibration, cases: Sequence[Case]) -> dict[str, Any]:
+    """The JSON of a study: the tallies, every estimate with its truth, and every flight."""
+    return plain(
+        {
+            **asdict(calibration),
+            "estimates": [
+                {
+                    "number": c.number,
+                    "effect": s.name,
+                    "error": s.error,
+                    "excitation": c.excitation(s),
+                    "inside": all(e.inside for e in s.estimates if e.truth is not None),
+                }
+                for c in cases
+                for s in c.named()
+                if s.name in c.truth and s.error is not None
+            ],
+            "cases": [asdict(c) for c in cases],
+        }
+    )

@@ -7,6 +7,7 @@ import typer
 from groundstation import (
     analysis_commands,
     bound_commands,
+    calibrate_commands,
     collect_commands,
     effect_commands,
     flight_commands,
@@ -41,6 +42,7 @@ reproduce_commands.register(app)
 remainder_commands.register(app)
 plan_commands.register(app)
 survey_commands.register(app)
+calibrate_commands.register(app)
 
 
 def main() -> None:

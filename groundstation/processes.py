@@ -36,7 +36,7 @@ def run_json(command: Sequence[object]) -> dict[str, Any]:
         ) from None
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
-        raise InputError(f"{' '.join(map(str, command[:2]))} failed: {last}")
+        raise InputError(f"{' '.join(map(str, command[:2]))} failed: {last.removeprefix('error: ')}")
     answer: dict[str, Any] = json.loads(done.stdout)
     return answer
 

@@ -204,11 +204,17 @@ def fly(
     rate: Annotated[float, typer.Option(help="Control rate, Hz.")] = 100.0,
     hidden: HiddenNames = None,
     hidden_count: HiddenCount = None,
+    strength: Annotated[
+        float, typer.Option(help="Factor on the sizes of what is hidden by name, `random` or `any`.", min=0.0)
+    ] = 1.0,
     seed: Seed = None,
     sealed: Sealed = None,
     noise: NoiseScale = None,
     charge: Charge = None,
     battery_age: BatteryAge = None,
+    rotor_speeds: Annotated[
+        bool, typer.Option("--rotor-speeds/--no-rotor-speeds", help="Whether the record has rotor speeds.")
+    ] = True,
     table: Annotated[bool, typer.Option("--csv", help="Write a CSV beside the record, too.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -238,7 +244,7 @@ def fly(
         believed,
         load_design(gains, believed),
         _trajectory(trajectory, parameter or []),
-        choose(list(settings.hidden), believed, settings.seed, settings.hidden_count),
+        choose(list(settings.hidden), believed, settings.seed, settings.hidden_count, strength),
         settings.seed,
         repeat,
         rate,
@@ -248,6 +254,7 @@ def fly(
         controller,
         settle,
         TrimLimits() if trim is None else TrimLimits(bandwidth=trim),
+        rotor_speeds,
     )
     csv_file = output.with_suffix(".csv") if table else None
     seconds = plan.repeat * plan.trajectory.duration

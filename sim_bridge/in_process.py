@@ -44,7 +44,8 @@ class Plan:
 
     `controller` is one of `companion.controllers.CONTROLLERS`; `corrected` needs a `model`, the others take none.
     Where it is empty the vehicle flies `corrected` with a model and `lqr` without. For `settle` s the vehicle holds
-    the start before the trajectory begins, as the companion does: a correction has faded in by then.
+    the start before the trajectory begins, as the companion does: a correction has faded in by then. The record has
+    `rotor_speeds` where the vehicle's speed controllers report them.
     """
 
     vehicle: Vehicle
@@ -60,6 +61,7 @@ class Plan:
     controller: str = ""
     settle: float = 0.0
     trim: TrimLimits = field(default_factory=TrimLimits)
+    rotor_speeds: bool = True
 
     def __post_init__(self) -> None:
         if not self.controller:
@@ -265,7 +267,7 @@ def record(
     if recorder.error:
         raise InputError(recorder.error)
     if table is not None:
-        _write_csv(table, rows)
+        _write_csv(table, rows, plan.rotor_speeds)
     return flown
 
 
@@ -277,6 +279,7 @@ class _TickWriter:
     def __init__(self, plan: Plan) -> None:
         self.messages: list[tuple[bytes, int, int]] = []
         self._interval = 1.0 / plan.rate
+        self._rotor_speeds = plan.rotor_speeds
         # What is the same in every tick is set once; each tick then overwrites all the rest.
         self._tick = Tick(
             controller=plan.controller,
@@ -327,7 +330,8 @@ class _TickWriter:
         v = tick.body_rate_command
         v.x, v.y, v.z = control.command.body_rate
         tick.battery_voltage = now.battery_voltage
-        tick.rotor_speed[:] = now.rotor_speed
+        if self._rotor_speeds:
+            tick.rotor_speed[:] = now.rotor_speed
         tick.guard = sample.guard
         tick.phase = "mission" if sample.mission else "takeoff"
         tick.inference = sample.inference
@@ -359,12 +363,13 @@ def _row(sample: Sample) -> tuple[float, ...]:
     )
 
 
-def _write_csv(path: Path, rows: list[tuple[float, ...]]) -> None:
+def _write_csv(path: Path, rows: list[tuple[float, ...]], rotor_speeds: bool) -> None:
     names = ["t"] + [name for column in _TABLE_COLUMNS for name in COLUMNS[column][0]]
+    kept = [i for i, name in enumerate(names) if rotor_speeds or name not in COLUMNS["rotor_speed"][0]]
     try:
         with path.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
-            writer.writerow(names)
-            writer.writerows([f"{value:.7g}" for value in row] for row in rows)
+            writer.writerow([names[i] for i in kept])
+            writer.writerows([f"{row[i]:.7g}" for i in kept] for row in rows)
     except OSError as error:
         raise InputError(f"{path}: cannot write the table ({error.strerror})") from None

@@ -24,6 +24,20 @@ ERROR = tuple(f"#00{number:02x}02" for number in range(LEVELS))
 BESIDE = tuple(f"#00{number:02x}03" for number in range(6))
 """What is compared side by side."""
 
+LIGHT = {
+    "ink": "#1b1f24",
+    "muted": "#5b636e",
+    "grid": "#dde1e6",
+    "measured": "#a3abb5",
+    "linear": "#b5540a",
+    "before": "#d55e00",
+    "after": "#0b6bb5",
+    "held": "#00835f",
+    "floor": "#777777",
+    "worst": "#e69f00",
+}
+"""What the page's stylesheet gives them in light, for a picture that stands alone."""
+
 STYLE = {
     "svg.fonttype": "none",
     "svg.hashsalt": "trueflight",
@@ -65,6 +79,12 @@ def figure(
 def style() -> AbstractContextManager[None]:
     """While it holds, figures are drawn in the style of the page."""
     return matplotlib.rc_context(STYLE)
+
+
+def light_style() -> AbstractContextManager[None]:
+    """While it holds, figures are drawn in the colours of `LIGHT`."""
+    given = {stand_in: LIGHT[name] for name, stand_in in COLOURS.items()}
+    return matplotlib.rc_context({k: given.get(v, v) if isinstance(v, str) else v for k, v in STYLE.items()})
 
 
 def to_svg(made: Figure, name: str, alt: str) -> Markup:

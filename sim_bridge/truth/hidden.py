@@ -24,6 +24,15 @@ from sim_bridge.world import PHYSICS_STEP, World
 Event = tuple[float, Callable[[World], None]]
 
 
+_MASS, _RADIUS = 0.75, 0.0635
+"""kg and m: the 5-inch quadrotor that the ranges of sizes were chosen for."""
+
+
+def _times_larger(vehicle: Vehicle) -> float:
+    """How many times larger a vehicle is, by its rotors."""
+    return vehicle.rotor_radius / _RADIUS
+
+
 @dataclass(frozen=True)
 class Hidden:
     """One hidden effect with every number that it acts by."""
@@ -65,6 +74,14 @@ class Effect:
         drawn = generator.uniform(self.low, self.high)
         return {next(iter(self.units)): drawn if size is None else size}
 
+    def neutral(self, vehicle: Vehicle) -> float:
+        """The size at which nothing is hidden."""
+        return 0.0
+
+    def scale(self, vehicle: Vehicle) -> float:
+        """How many times larger than on the 5-inch quadrotor that `low` and `high` were chosen for."""
+        return 1.0
+
     def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
         """The powertrain with this effect."""
         return train
@@ -103,6 +120,10 @@ class ThrustGain(Effect):
         up, down = generator.uniform(0.07, 0.18), -generator.uniform(0.04, 0.07)
         off = generator.choice((up, down))
         return {"gain": 1.0 + off if size is None else size}
+
+    def neutral(self, vehicle: Vehicle) -> float:
+        """A factor of one."""
+        return 1.0
 
     def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
         """Thrust constants times the gain."""
@@ -160,6 +181,10 @@ class MotorLag(Effect):
         least = max(self.low, vehicle.motor_time_constant + 0.025)
         drawn = generator.uniform(least, max(self.high, least + 0.013))
         return {"time_constant": drawn if size is None else size}
+
+    def neutral(self, vehicle: Vehicle) -> float:
+        """The believed time constant."""
+        return vehicle.motor_time_constant
 
     def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:
         """The true time constant of rotor speed."""
@@ -253,6 +278,10 @@ class ParasiticDrag(Effect):
         y_ratio, z_ratio = generator.uniform(1.0, 1.3), generator.uniform(1.2, 1.8)
         x = x if size is None else size
         return {"x": x, "y": y_ratio * x, "z": z_ratio * x}
+
+    def scale(self, vehicle: Vehicle) -> float:
+        """Area over mass, of a body of the same density."""
+        return 1.0 / _times_larger(vehicle)
 
     def attach(
         self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
@@ -587,6 +616,10 @@ class ImuLeverArm(Effect):
         x, y, z = (size * a / length for a in axis)
         return {"length": size, "x": x, "y": y, "z": z}
 
+    def scale(self, vehicle: Vehicle) -> float:
+        """A distance on the frame."""
+        return _times_larger(vehicle)
+
     def attach(
         self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
     ) -> None:
@@ -610,6 +643,10 @@ class CentreOfMassOffset(Effect):
         drawn, direction = generator.uniform(self.low, self.high), generator.uniform(-math.pi, math.pi)
         size = drawn if size is None else size
         return {"distance": size, "x": size * math.cos(direction), "y": size * math.sin(direction)}
+
+    def scale(self, vehicle: Vehicle) -> float:
+        """A distance on the frame."""
+        return _times_larger(vehicle)
 
     def attach(
         self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
@@ -674,6 +711,10 @@ class Gyroscopic(Effect):
     )
     low, high, most, drawn, any_draws = 1.5e-5, 4e-5, 1.0, False, False
     units: ClassVar = {"inertia": "kg m^2"}
+
+    def scale(self, vehicle: Vehicle) -> float:
+        """A moment of inertia, of rotors that weigh the same share of the vehicle."""
+        return vehicle.mass / _MASS * _times_larger(vehicle) ** 2
 
     def attach(
         self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
@@ -741,8 +782,12 @@ def pool(request: str) -> list[str]:
     return [n for n, e in EFFECTS.items() if (e.drawn if e.any_draws is None else e.any_draws)]
 
 
-def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> tuple[Hidden, ...]:
+def choose(
+    requests: list[str], vehicle: Vehicle, seed: int, count: int = 1, strength: float = 1.0
+) -> tuple[Hidden, ...]:
     """What to hide, from `NAME`, `NAME:SIZE`, `none`, `random` or `rich` requests; the same seed hides the same.
+
+    Sizes that are drawn are `strength` times as far from "nothing hidden" as usual; `rich` and given sizes stay.
 
     `random` draws `count` different effects of the first catalogue, `any` of all that act for a whole flight (so
     that a seed of `random` hides for ever what it hid), `rich` is that of `rich()`; what follows it may override a
@@ -762,7 +807,7 @@ def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> 
                 f"trueflight {seed}" if request == "random" else f"trueflight any {seed}"
             )
             for name in generator.sample(drawable, count):
-                chosen[name] = _make(name, None, vehicle, seed)
+                chosen[name] = _make(name, None, vehicle, seed, strength)
             continue
         if request == "rich":
             chosen |= {one.name: one for one in rich(vehicle, seed)}
@@ -786,13 +831,22 @@ def choose(requests: list[str], vehicle: Vehicle, seed: int, count: int = 1) -> 
                 raise InputError(
                     f"--hidden {request}: size must be {effect.least:g} to {effect.most:g} {unit}"
                 )
-        chosen[name] = _make(name, size, vehicle, seed)
+        chosen[name] = _make(name, size, vehicle, seed, strength)
     return tuple(chosen.values())
 
 
-def _make(name: str, size: float | None, vehicle: Vehicle, seed: int) -> Hidden:
-    # A generator of its own for each effect, so that hiding one more does not change the others.
-    return Hidden(name, EFFECTS[name].draw(vehicle, size, random.Random(f"trueflight {seed} {name}")))
+def _make(name: str, size: float | None, vehicle: Vehicle, seed: int, strength: float) -> Hidden:
+    effect = EFFECTS[name]
+
+    def draw(size: float | None) -> dict[str, float]:
+        # A generator of its own for each effect, so that hiding one more does not change the others.
+        return effect.draw(vehicle, size, random.Random(f"trueflight {seed} {name}"))
+
+    numbers, factor = draw(size), strength * effect.scale(vehicle)
+    if size is None and factor != 1.0:
+        nothing = effect.neutral(vehicle)
+        numbers = draw(nothing + factor * (numbers[next(iter(effect.units))] - nothing))
+    return Hidden(name, numbers)
 
 
 def install(

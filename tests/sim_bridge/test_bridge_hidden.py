@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -380,3 +381,32 @@ def test_any_draws_from_more_and_random_from_what_it_always_did(vehicle: Vehicle
     ]
     assert {choose(["any"], vehicle, seed)[0].name for seed in range(300)} == set(pool("any"))
     assert choose(["any"], vehicle, 4, 3) == choose(["any"], vehicle, 4, 3)
+
+
+@pytest.mark.parametrize("name", list(EFFECTS))
+def test_half_the_strength_is_half_as_far_from_nothing_and_in_the_same_direction(
+    vehicle: Vehicle, name: str
+) -> None:
+    effect = EFFECTS[name]
+    first, nothing = next(iter(effect.units)), effect.neutral(vehicle)
+    (usual,), (half,) = (choose([name], vehicle, 3, strength=strength) for strength in (1.0, 0.5))
+    assert half.parameters[first] - nothing == pytest.approx(0.5 * (usual.parameters[first] - nothing))
+    if "x" in usual.parameters and first != "x":
+        assert half.parameters["x"] == pytest.approx(0.5 * usual.parameters["x"])
+    # what was asked for is what is hidden
+    given = f"{name}:{usual.parameters[first]!r}"
+    assert choose([given], vehicle, 3, strength=0.5)[0].parameters[first] == usual.parameters[first]
+
+
+def test_lengths_on_the_frame_go_with_its_size(vehicle: Vehicle) -> None:
+    large = replace(vehicle, rotor_radius=2.0 * vehicle.rotor_radius, mass=8.0 * vehicle.mass)
+    for name, factor in (
+        ("com_offset", 2.0),
+        ("imu_lever_arm", 2.0),
+        ("parasitic_drag", 0.5),
+        ("gyroscopic", 32.0),
+    ):
+        first = next(iter(EFFECTS[name].units))
+        (small,), (big,) = (choose([name], v, 3) for v in (vehicle, large))
+        assert big.parameters[first] == pytest.approx(factor * small.parameters[first]), name
+    assert choose(["rotor_drag"], large, 3) == choose(["rotor_drag"], vehicle, 3)

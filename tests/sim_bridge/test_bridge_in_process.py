@@ -141,3 +141,20 @@ def test_a_flight_that_is_lost_ends(vehicle: Vehicle, design: Design) -> None:
     flown = fly(replace(plan, hidden=strong), lambda sample: None)
     assert flown.outcome == "lost"
     assert flown.simulated < 60.0
+
+
+def test_a_record_without_rotor_speeds_is_otherwise_the_same(
+    vehicle: Vehicle, design: Design, tmp_path: Path
+) -> None:
+    plan = Plan(vehicle, design, trajectory("hover", duration=1.0), seed=2)
+    for name, one in (("with", plan), ("without", replace(plan, rotor_speeds=False))):
+        record(one, tmp_path / f"{name}.mcap", tmp_path / f"{name}.csv")
+    told, silent = (read_record(tmp_path / f"{name}.mcap").ticks for name in ("with", "without"))
+    assert np.all(told["rotor_speed"] > 100.0)
+    assert not np.any(np.nan_to_num(silent.get("rotor_speed", np.zeros(1))))
+    assert np.array_equal(told["specific_force"], silent["specific_force"])
+    columns = [
+        (tmp_path / f"{name}.csv").read_text().splitlines()[0].split(",") for name in ("with", "without")
+    ]
+    assert set(columns[0]) - set(columns[1]) == {f"rotor_speed_{i}" for i in range(1, 5)}
+    assert len((tmp_path / "without.csv").read_text().splitlines()[-1].split(",")) == len(columns[1])
