@@ -11,12 +11,14 @@ from typing import Any
 
 from companion.control import ControlLaw
 from companion.director import Director
-from companion.flight import Flight
+from companion.flight import IDLE, Flight
+from companion.pose import PoseFeed
 from companion.settings import Settings
 from companion.store import ModelStore
 from companion.telemetry import Telemetry, make_event, read_json
 from companion.tick import make_tick
 from companion.vehicle_link import Odometry, VehicleLink
+from companion.watchdog import Watchdog, raise_priority
 from companion.zenoh_session import open_session
 from models.design import load_design
 from models.errors import InputError
@@ -81,6 +83,9 @@ class Companion:
         )
         self._vehicle_time_us = 0
         self._errors_told = 0
+        self._told_by_autopilot = ""
+        self.watchdog = Watchdog()
+        self._priority = settings.realtime
         self.telemetry = Telemetry(
             session,
             vehicle.name,
@@ -91,10 +96,18 @@ class Companion:
             },
             records,
         )
+        self.pose: PoseFeed | None = None
+        if settings.pose.enabled:
+            self.pose = PoseFeed(settings.pose, self.link.send_pose, self.emit)
+            self.director.pose = self.pose
+            self.link.share_clock()
+            self.telemetry.subscribe("pose", self.pose.take)
         for reason in store.refused_at_start:
             self.emit("warning", "model_refused", f"no longer accepted: {reason}")
         self.link.on_odometry = self._control
         self.link.on_error = self._wire_error
+        self.link.on_blind = self.watchdog.tick  # nothing to control by, but the control thread is well
+        self.link.on_notice = self._autopilot_tells
         try:
             self._settle_rates(settings.rate)
         except InputError:
@@ -114,11 +127,14 @@ class Companion:
 
     def stop(self) -> None:
         """Land what is in the air and let `run` return; safe from a signal handler."""
+        self.watchdog.stopping()
         self.director.stopping.set()
 
     def close(self) -> None:
         """Disconnect from vehicle and ground."""
         self.link.on_odometry = lambda odometry: None
+        if self.pose is not None:
+            self.pose.close()
         self.link.close()
         self.telemetry.close()
 
@@ -132,6 +148,8 @@ class Companion:
 
     def _control(self, odometry: Odometry) -> None:
         """The control loop: one odometry message in, at most one setpoint out, then the book-keeping."""
+        if self._priority:
+            self._raise_priority()
         latest = self.link.latest
         outcome = self.flight.tick(odometry, latest)
         step = outcome.step
@@ -145,6 +163,24 @@ class Companion:
         if recorder is not None:
             recorder.tick(data, odometry.vehicle_time_us, odometry.host_time_ns)
         self.telemetry.tick(data)
+        self.watchdog.tick()
+
+    def _raise_priority(self) -> None:
+        """Once, by the control thread itself, which is MAVSDK's."""
+        priority, self._priority = self._priority, 0
+        reason = raise_priority(priority)
+        if reason:
+            self.emit("warning", "realtime", f"the control thread has no real-time priority: {reason}")
+        else:
+            self.emit("info", "realtime", f"the control thread runs at real-time priority {priority}")
+
+    def _autopilot_tells(self, text: str) -> None:
+        """What the autopilot says of failsafes and switches belongs into the record of a flight, once."""
+        if self.flight.phase == IDLE:
+            self._told_by_autopilot = ""
+        elif text != self._told_by_autopilot:
+            self._told_by_autopilot = text
+            self.emit("warning", "autopilot", text)
 
     def _wire_error(self, text: str) -> None:
         self._errors_told += 1

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
+from companion import onboard_commands
 from models.errors import run_command_line
 
 app = typer.Typer(
@@ -112,11 +113,10 @@ def run(
     rates = companion.director.rates
     assert rates is not None
     where = ", ".join(settings.zenoh.listen) or settings.zenoh.config or "Zenoh"
-    typer.echo(
-        f"ready: {companion.director.vehicle.name} at {rates.odometry:.0f} Hz on {settings.connect}, "
-        f"missions on {where}"
-    )
+    ready = f"{companion.director.vehicle.name} at {rates.odometry:.0f} Hz on {settings.connect}, missions on {where}"
+    typer.echo(f"ready: {ready}")
     sys.stdout.flush()
+    companion.watchdog.ready(ready)
     try:
         companion.run()
     finally:
@@ -203,6 +203,9 @@ def trajectories(as_json: Json = False) -> None:
         ]
         table.add_row(name, kind.text, escape(", ".join(parameters)))
     Console().print(table)
+
+
+onboard_commands.register(app)
 
 
 def main() -> None:

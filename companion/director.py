@@ -17,8 +17,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from companion.flight import IDLE, LANDING, SILENT, TAKEOFF, Decision, Flight, Mission, Safety
+from companion.flight import IDLE, LANDING, MISSION, SILENT, TAKEOFF, Decision, Flight, Mission, Safety
 from companion.guard import Guard
+from companion.message_rates import link_too_slow, odometry_too_low
+from companion.pose import PoseFeed
 from companion.shadow import Shadow, ShadowLimits
 from companion.store import ModelStore
 from companion.vehicle_link import Rates, VehicleLink
@@ -39,7 +41,6 @@ _STALLED, _GONE = (
     0.5,
     10.0,
 )  # s without a tick that are told, and without any sign of the vehicle that end a flight
-_RATE_SHARE = 0.75
 _ORDER_TIMEOUT = 0.2  # s for the next tick
 _SHADOW_SECONDS = (0.5, 600.0)
 _MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
@@ -75,6 +76,7 @@ class Director:
     emit: Callable[[str, str, str], None]
     recorder: FlightRecorder | None = None
     rates: Rates | None = None
+    pose: PoseFeed | None = None
     stopping: threading.Event = field(default_factory=threading.Event)
     _queue: deque[Progress] = field(default_factory=deque)
     _known: dict[str, Progress] = field(default_factory=dict)
@@ -196,6 +198,7 @@ class Director:
             "rates": {}
             if rates is None
             else {"odometry": round(rates.odometry, 1), "imu": round(rates.imu, 1)},
+            "pose": {} if self.pose is None else self.pose.status(),
             "recording": str(self.recorder.path) if self.recorder else "",
             "malformed_messages": self.link.malformed,
             **self.store.describe(),
@@ -213,31 +216,42 @@ class Director:
         low = self.safety.takeoff_voltage * self.vehicle.nominal_voltage
         if 0.0 < latest.battery_voltage < low:
             return f"the battery has {latest.battery_voltage:.1f} V, a flight needs {low:.1f} V"
+        if self.pose is not None and self.pose.why_not:
+            return self.pose.why_not
+        if self.lost_position:
+            return self.lost_position
         return self.rates_too_low(self.rates)
+
+    @property
+    def lost_position(self) -> str:
+        """'' where the estimator has a position that is good enough, or says nothing of it."""
+        accuracy, most = self.link.latest.position_accuracy, self.safety.position_accuracy
+        if accuracy <= most:
+            return ""
+        told = (
+            f"knows the position to {accuracy:.1f} m only" if math.isfinite(accuracy) else "has no position"
+        )
+        return (
+            f"the autopilot's estimator {told}; a flight needs {most:g} m (GPS, or mocap with EKF2_EV_CTRL)"
+        )
 
     def rates_too_low(self, rates: Rates | None) -> str:
         """'' where odometry and accelerometer arrive often enough, otherwise what is missing."""
         if rates is None:
             return "rates have not been measured yet"
-        if rates.odometry < _RATE_SHARE * self.rate:
-            return (
-                f"odometry arrives at {rates.odometry:.0f} Hz, {self.rate:.0f} Hz were asked for; "
-                "lower --rate, or let the autopilot send more (PX4: EKF2_PREDICT_US, the link's MAV_x_RATE)"
-            )
+        too_low = odometry_too_low(rates, self.rate)
+        if too_low:
+            return too_low
         if rates.longest_gap > self.safety.odometry_gap:
             return f"odometry had a gap of {rates.longest_gap:.2f} s; the link or this machine is too busy"
         if rates.imu < 0.5 * min(self.rate, 100.0):
-            return f"HIGHRES_IMU arrives at {rates.imu:.0f} Hz; the link is too slow for it (PX4: MAV_x_RATE)"
+            return link_too_slow(f"HIGHRES_IMU at {rates.imu:.0f} Hz")
         return ""
 
     def _command(self, command: str) -> dict[str, Any]:
         if command not in ("abort", "land"):
             return {"accepted": False, "reason": f"unknown command '{command}'; use abort or land"}
-        with self._lock:
-            waiting = len(self._queue)
-            for progress in self._queue:
-                progress.state, progress.reason = "aborted", f"{command} from the ground"
-            self._queue.clear()
+        waiting = self._drop_queue(f"{command} from the ground")
         if self.flight.phase == IDLE:
             done = f"{waiting} queued missions dropped; nothing is flying"
             return {"accepted": True, "reason": done}
@@ -375,6 +389,17 @@ class Director:
         # Told last: whoever hears that it is over may fetch the record, which must be whole by then.
         progress.reason = outcome
         progress.state = "finished" if outcome == "finished" else "aborted"
+        if progress.state == "aborted":
+            self._drop_queue("the flight before it ended early; ask again")
+
+    def _drop_queue(self, reason: str) -> int:
+        """Forget the missions that wait; the number of them. Whoever ended a flight early does not want the next."""
+        with self._lock:
+            waiting = len(self._queue)
+            for progress in self._queue:
+                progress.state, progress.reason = "aborted", reason
+            self._queue.clear()
+        return waiting
 
     def _renewed(self, progress: Progress) -> str:
         """What is live now flies, not what was when the mission was asked for; '' or the reason why not."""
@@ -405,13 +430,13 @@ class Director:
             return "no odometry, so no setpoint could be sent"
         reason = self.link.set_mode("OFFBOARD")
         if reason:
-            return f"the autopilot refused Offboard ({reason})"
+            return self._refused(f"the autopilot refused Offboard ({reason})")
         if not self._wait(lambda: latest.flight_mode == "OFFBOARD", _MODE_TIMEOUT):
             return f"the autopilot stayed in {latest.flight_mode}"
         self._record(progress)
         reason = self.link.arm()
         if reason:
-            return f"the autopilot refused to arm ({reason})"
+            return self._refused(f"the autopilot refused to arm ({reason})")
         if not self._wait(lambda: latest.armed, _ARM_TIMEOUT):
             return "the autopilot did not arm"
         if latest.flight_mode != "OFFBOARD":
@@ -423,6 +448,12 @@ class Director:
         if staged and flight.candidate is None:
             self._try(staged)
         return ""
+
+    def _refused(self, what: str) -> str:
+        """Why, in plain words, where the autopilot tells; asked while setpoints are still streaming."""
+        report = self.link.arming_report()
+        problems = report.reasons(streaming=True) if report is not None else ()
+        return f"{what}: {'; '.join(problem.line for problem in problems)}" if problems else what
 
     def _accompany(self) -> None:
         """Do what the flight asks for that may block, until it is over."""
@@ -440,6 +471,10 @@ class Director:
                 reason = self.link.set_mode("LAND")
                 if reason and tries >= _LAND_TRIES:
                     flight.give_up(f"the autopilot refused Land ({reason})")
+            if flight.phase in (TAKEOFF, MISSION):
+                blind = (self.pose.why_not if self.pose is not None else "") or self.lost_position
+                if blind:
+                    flight.land(blind, return_home=False)
             on_ground = latest.landed == "on ground" and flight.phase != TAKEOFF and not flight.sending
             grounded = min(grounded, now) if on_ground else math.inf
             if now - grounded > _DISARM_AFTER and latest.armed and flight.phase == LANDING:

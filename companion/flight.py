@@ -46,7 +46,8 @@ class Safety:
     The fence is a cylinder around home: `fence_radius`, `fence_height` in m. `takeoff_voltage` and
     `land_voltage` are shares of the nominal voltage; the latter ends a flight when it lasts
     `battery_patience` s. `odometry_gap` s of the vehicle's clock without odometry end a flight, as do a jump
-    of the position by `jump` m between two messages and a distance of `lost` m from the reference.
+    of the position by `jump` m between two messages, a distance of `lost` m from the reference and an estimator that
+    knows its horizontal position to no better than `position_accuracy` m.
     `climb_speed` and `transfer_speed` in m/s.
     """
 
@@ -58,6 +59,7 @@ class Safety:
     odometry_gap: float = 0.25
     jump: float = 1.0
     lost: float = 4.0
+    position_accuracy: float = 2.0
     climb_speed: float = 0.8
     transfer_speed: float = 1.5
 
@@ -425,9 +427,11 @@ class Flight:
                 one.start() if on else one.stop()
 
     def _watch_mode(self, latest: Latest) -> None:
-        """The pilot wins, and a vehicle that is not armed flies no more."""
+        """The pilot wins, so do the autopilot's failsafes, and a vehicle that is not armed flies no more."""
         if self._leg is None:  # streaming, not yet armed by us: `take_off` follows only on armed and Offboard
             return
+        if (latest.killed or latest.flight_mode == "TERMINATION") and self.phase != SILENT:
+            self._silence("kill_switch", f"the motors were cut{_because(latest)}: silent")
         if not latest.armed:
             if self.phase != LANDING and not self.outcome:
                 self.outcome = "the vehicle was disarmed in flight"
@@ -436,9 +440,15 @@ class Flight:
         elif latest.flight_mode != "OFFBOARD" and self.phase != SILENT:
             if self.wants_land and latest.flight_mode == "LAND":
                 return
-            self._silence(
-                "pilot_takeover", f"{latest.flight_mode} was chosen by the pilot or the autopilot: silent"
-            )
+            if latest.failsafe:
+                text = (
+                    f"{latest.flight_mode} was chosen by the autopilot's failsafe{_because(latest)}: silent"
+                )
+                self._silence("failsafe", text)
+            else:
+                who = f"the pilot or a ground station{_because(latest)}"
+                text = f"{latest.flight_mode} was chosen by {who}: silent"
+                self._silence("pilot_takeover", text)
 
     def _watch(
         self, odometry: Odometry, previous: Odometry | None, interval: float, position: Vector, latest: Latest
@@ -554,6 +564,11 @@ class Flight:
         shadow, self.candidate = self.candidate, None
         if shadow is not None:
             self.decisions.append(Decision("undecided", shadow.name))
+
+
+def _because(latest: Latest) -> str:
+    """What the autopilot told just now, in brackets."""
+    return f" ({latest.why})" if latest.why else ""
 
 
 def _finite(force: Vector | None) -> Vector | None:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from companion.control import Limits
 from companion.controllers import TrimLimits
 from companion.flight import Safety
+from companion.pose import PoseSettings
 from companion.shadow import ShadowLimits
 from companion.watch import GuardLimits
 from companion.zenoh_session import ZenohSettings
@@ -25,7 +26,7 @@ class Settings:
     """Everything `companion run` needs; the sections are the settings of the parts.
 
     `design` empty means `design.json` beside the vehicle file. `rate` in Hz, `timeout` in s to wait for an
-    autopilot.
+    autopilot. `realtime` is the priority (SCHED_FIFO) that the control thread asks for, 0 for none.
     """
 
     vehicle: str = ""
@@ -41,6 +42,8 @@ class Settings:
     guard: GuardLimits = field(default_factory=GuardLimits)
     shadow: ShadowLimits = field(default_factory=ShadowLimits)
     trim: TrimLimits = field(default_factory=TrimLimits)
+    pose: PoseSettings = field(default_factory=PoseSettings)
+    realtime: int = field(default=0, metadata={"zero": True})
 
     def checked(self) -> Settings:
         """The same, or `InputError` for a value without sense."""
@@ -48,6 +51,9 @@ class Settings:
             raise InputError(f"rate = {self.rate:g} is outside 10 to 1000 Hz")
         if not 0.1 <= self.timeout <= 600.0:
             raise InputError(f"timeout = {self.timeout:g} is outside 0.1 to 600 s")
+        if not 0 <= self.realtime <= 80:
+            raise InputError(f"realtime = {self.realtime} is outside 0 (off) to 80")
+        self.pose.checked()
         if not self.vehicle:
             raise InputError("no vehicle file; pass --vehicle FILE or set 'vehicle' in the configuration")
         return self
@@ -97,7 +103,7 @@ def _filled(default: T, table: dict[str, Any], where: str, section: str) -> T:
             hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
             raise InputError(f"{where}: unknown key '{name}'; {hint}")
         if value == 0 and key in may_be_zero and not isinstance(value, bool):
-            changes[key] = 0.0
+            changes[key] = type(known[key])(0)
             continue
         changes[key] = _value(known[key], value, f"{where}: '{name}'")
     return replace(default, **changes)  # type: ignore[type-var]
@@ -110,6 +116,10 @@ def _value(default: Any, value: Any, where: str) -> Any:
             raise InputError(f"{where} must be a section, not {value!r}")
         file, _, section = where.partition(": ")
         return _filled(default, value, file, section.strip("'"))
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise InputError(f"{where} must be true or false, not {value!r}")
+        return value
     if isinstance(default, str):
         if not isinstance(value, str):
             raise InputError(f"{where} must be a text, not {value!r}")

@@ -31,6 +31,19 @@ class Stored:
     model: Model | None = None
 
 
+def live_file(folder: Path) -> Path | None:
+    """The live model's file of a folder that perhaps somebody else is using; None without one."""
+    names = _names_of(folder)
+    return folder / f"{names[-1]}.onnx" if names else None
+
+
+def _names_of(folder: Path) -> list[str]:
+    try:
+        return [str(name) for name in json.loads((folder / _HISTORY).read_text(encoding="utf-8"))]
+    except (OSError, ValueError, TypeError):
+        return []
+
+
 class ModelStore:
     """Accepted models in a folder; safe to use from several threads.
 
@@ -49,11 +62,7 @@ class ModelStore:
         folder.mkdir(parents=True, exist_ok=True)
         for left in folder.glob("*.staged"):
             left.unlink()
-        try:
-            names = [str(name) for name in json.loads((folder / _HISTORY).read_text(encoding="utf-8"))]
-        except (OSError, ValueError, TypeError):
-            names = []
-        self._restore(names[-KEPT:])
+        self._restore(_names_of(folder)[-KEPT:])
 
     @property
     def live(self) -> Model | None:

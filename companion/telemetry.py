@@ -9,7 +9,7 @@ or `{"setpoints": CSV, ...}` or `{"command": "abort" | "land"}`. * `model`: quer
 file (`model?shadow=SECONDS`: how long to evaluate it in flight before it is applied), or JSON `{"command": "list"
 | "rollback"}`. * `record`: query with JSON `{}` for the list, or `{"name",
 "offset", "length"}` for a piece of one record: its bytes as `application/octet-stream`, with JSON `{"size",
-"offset"}` attached; ask on until `offset` reaches `size`.
+"offset"}` attached; ask on until `offset` reaches `size`. * `pose`: subscribed, see `models.pose`.
 
 Every other answer is JSON with `accepted` and `reason`. Zenoh's callbacks only enqueue. The control thread
 never calls Zenoh: it hands serialised ticks to a publishing thread through a bounded queue and goes on. What
@@ -63,7 +63,8 @@ class Telemetry:
         records: Path,
     ) -> None:
         self.ticks_dropped = 0
-        self._session, self._records = session, records
+        self._session, self._records, self._vehicle = session, records, vehicle
+        self._subscribers: list[zenoh.Subscriber[Any]] = []
         self._handlers = {"record": self._record, **handlers}
         self._quick: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(REQUESTS_WAITING)
         self._slow: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(REQUESTS_WAITING)
@@ -117,6 +118,13 @@ class Telemetry:
         self._events.append(event.SerializeToString())
         self._wake.set()
 
+    def subscribe(self, leaf: str, take: Callable[[bytes], None]) -> None:
+        """Call `take` with each payload published on `leaf`; on Zenoh's thread, so it must only enqueue."""
+        key = contract.key(self._vehicle, leaf)
+        self._subscribers.append(
+            self._session.declare_subscriber(key, lambda sample: take(sample.payload.to_bytes()))
+        )
+
     def close(self) -> None:
         """Publish what waits, say good-bye and close the session."""
         self._closing = True
@@ -127,6 +135,8 @@ class Telemetry:
         for thread in self._threads:
             thread.join(2.0)
         self._token.undeclare()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
         for queryable in self._queryables:
             queryable.undeclare()
         self._session.close()

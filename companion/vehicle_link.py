@@ -23,11 +23,23 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import mavsdk
+import numpy as np
 from mavsdk.mavsdk import Configuration, Mavsdk
 from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
-from mavsdk.plugins.param import Param
+from mavsdk.plugins.mocap.mocap import (
+    AngleBody,
+    Covariance,
+    Mocap,
+    MocapError,
+    PositionBody,
+    VisionPositionEstimate,
+)
+from mavsdk.plugins.param.param import Param, ParamError, ParamResult
 
+from companion.px4_events import ArmingChecks, ArmingReport, Px4Event, describe, unhealthy
+from models import frames
 from models.errors import InputError
+from models.pose import Pose
 
 Vector = tuple[float, float, float]
 
@@ -43,8 +55,12 @@ _MESSAGE_IDS = {
     "EXTENDED_SYS_STATE": 245,
     "CURRENT_MODE": 436,
     "HEARTBEAT": 0,
+    "AUTOPILOT_VERSION": 148,
+    "TIMESYNC": 111,
+    "ESTIMATOR_STATUS": 230,
 }
 _SET_MESSAGE_INTERVAL, _DO_SET_MODE, _ARM_DISARM = 511, 176, 400
+_RUN_PREARM_CHECKS, _REQUEST_MESSAGE = 401, 512
 _ACCEPTED = 0
 _RESULTS = {
     1: "temporarily rejected",
@@ -55,6 +71,11 @@ _RESULTS = {
     6: "cancelled",
 }
 _ARMED = 128
+_CRITICAL, _TERMINATED = 5, 8  # MAV_STATE of a failsafe that acts, and of motors that are cut
+_POSITION, _HELD = 8 | 16, 128  # ESTIMATOR_POS_HORIZ_REL or _ABS; ESTIMATOR_CONST_POS_MODE
+_GROUND_STATION_HEARTBEAT = (
+    '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
+)
 _MODES = {
     (1, 0): "MANUAL",
     (2, 0): "ALTCTL",
@@ -70,9 +91,12 @@ _MODES = {
     (6, 0): "OFFBOARD",
     (7, 0): "STABILIZED",
     (8, 0): "RATTITUDE",
+    (10, 0): "TERMINATION",
 }
 _MODE_NUMBERS = {"OFFBOARD": (6, 0), "LAND": (4, 6), "HOLD": (4, 3)}
 _LANDED = {0: "unknown", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
+_RECENT = 2.0  # s
+_TIMESYNC_RATE = 50.0  # Hz; PX4 wants 500 answers
 _RPM = 2.0 * math.pi / 60.0
 _AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 
@@ -96,6 +120,10 @@ class Latest:
 
     `battery_voltage` V (0 unknown), `rotor_speed` rad/s (empty unknown). `imu` is HIGHRES_IMU as it came, not
     yet read: it arrives just before the odometry, and what it takes to read it would delay the setpoint.
+    `killed` while the motors are cut (kill switch, termination), `failsafe` where the mode is one that the
+    autopilot's failsafe chose, `unhealthy` what SYS_STATUS says is not well, `notices` what it told of failsafes,
+    switches and failed checks (monotonic s, text). `position_accuracy` is the estimator's own horizontal one, m:
+    infinite where it says that it has no position, 0 where it says nothing. PX4 sends odometry either way.
     """
 
     battery_voltage: float = 0.0
@@ -106,6 +134,17 @@ class Latest:
     heartbeat: float = -math.inf
     texts: deque[str] = field(default_factory=lambda: deque(maxlen=20))
     imu: str = ""
+    killed: bool = False
+    failsafe: bool = False
+    unhealthy: tuple[str, ...] = ()
+    position_accuracy: float = 0.0
+    notices: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=4))
+
+    @property
+    def why(self) -> str:
+        """What the autopilot told in the last seconds, in plain words; '' where nothing."""
+        now = time.monotonic()
+        return "; ".join(text for told, text in tuple(self.notices) if now - told < _RECENT)
 
     @property
     def specific_force(self) -> Vector | None:
@@ -141,20 +180,27 @@ class VehicleLink:
 
     Raises `InputError` where the address cannot be used or nobody answers within `timeout` s. `on_odometry`
     is called with each odometry message on the control thread; what it raises ends up in `on_error` and sends
-    nothing.
+    nothing; `on_blind` takes its place for a message without an estimate. `on_notice` gets what the autopilot
+    tells of failsafes, switches and failed checks, in plain words.
     """
 
     def __init__(self, address: str = "udpin://127.0.0.1:14540", timeout: float = 10.0) -> None:
         self.address = address
         self.latest = Latest()
         self.on_odometry: Callable[[Odometry], None] = lambda odometry: None
+        self.on_blind: Callable[[], None] = lambda: None
         self.on_state: Callable[[], None] = lambda: None
         self.on_error: Callable[[str], None] = lambda text: None
+        self.on_notice: Callable[[str], None] = lambda text: None
         self.malformed = 0
         self._counts = dict.fromkeys(("ODOMETRY", "HIGHRES_IMU", "BATTERY_STATUS", "ESC_STATUS"), 0)
         self._times: deque[int] = deque(maxlen=4096)
         self._escs: dict[int, float] = {}
         self._param_lock = threading.Lock()
+        self._arming = ArmingChecks()
+        self._event_sequence = -1
+        self._text_number = -1
+        self._version = ""
         # MAVSDK prints what it does in colour on standard output, which belongs to our caller.
         mavsdk.log_subscribe(lambda level, text, file, line: True)
         # A ground station's heartbeat would turn STATUSTEXT on, but PX4 then counts us as its data link.
@@ -178,6 +224,7 @@ class VehicleLink:
             )
         self._system = system.get_system_id()
         self._param = Param(system)
+        self._mocap = Mocap(system)
         self._direct = MavlinkDirect(system)
         for name, handler in (
             ("ODOMETRY", self._odometry),
@@ -187,6 +234,10 @@ class VehicleLink:
             ("CURRENT_MODE", self._current_mode),
             ("EXTENDED_SYS_STATE", self._landed),
             ("STATUSTEXT", self._text),
+            ("EVENT", self._event),
+            ("SYS_STATUS", self._system_status),
+            ("ESTIMATOR_STATUS", self._estimator),
+            ("AUTOPILOT_VERSION", self._autopilot_version),
         ):
             self._direct.subscribe_message(name, self._safe(handler))
         self._direct.subscribe_message("HIGHRES_IMU", self._imu)
@@ -215,6 +266,26 @@ class VehicleLink:
             )
         )
 
+    def share_clock(self) -> None:
+        """Answer the autopilot's questions for our time, so that it understands the time stamps of poses.
+
+        MAVSDK leaves them unanswered, and PX4 then takes a pose for one of the moment of its arrival. It believes
+        the answers after 500 of them.
+        """
+        self._direct.subscribe_message("TIMESYNC", self._safe(self._timesync))
+        self.command(_SET_MESSAGE_INTERVAL, float(_MESSAGE_IDS["TIMESYNC"]), 1e6 / _TIMESYNC_RATE)
+
+    def send_pose(self, pose: Pose, taken_us: int, reset_counter: int) -> None:
+        """One VISION_POSITION_ESTIMATE, taken `taken_us` microseconds since 1970 by this machine's clock.
+
+        PX4's estimator takes this message and ODOMETRY alone, and MAVSDK's ODOMETRY names a frame that PX4 no
+        longer reads. Raises `RuntimeError` where MAVSDK refuses it.
+        """
+        try:
+            self._mocap.set_vision_position_estimate(vision_estimate(pose, taken_us, reset_counter))
+        except MocapError as error:
+            raise RuntimeError(error.result.name.lower().replace("_", " ")) from None
+
     def set_mode(self, mode: str) -> str:
         """Ask for a flight mode (OFFBOARD, LAND, HOLD); returns '' where accepted, otherwise the reason."""
         main, sub = _MODE_NUMBERS[mode]
@@ -241,6 +312,7 @@ class VehicleLink:
             "ESC_STATUS": min(rate, 100.0),
             "EXTENDED_SYS_STATE": 5.0,
             "CURRENT_MODE": 10.0,
+            "ESTIMATOR_STATUS": 5.0,
             "HEARTBEAT": 10.0,  # a pilot who takes over is heard within 0.1 s instead of 1 s
         }
         for name, wish in wishes.items():
@@ -272,12 +344,60 @@ class VehicleLink:
         silent.
         """
         with self._param_lock:
-            for get in (self._param.get_param_float, self._param.get_param_int):
-                try:
-                    return get(name)
-                except mavsdk.MavsdkError:
-                    continue
-        return None
+            try:
+                return float(self._param.get_param_float(name))
+            except ParamError as error:
+                if error.result != ParamResult.WRONG_TYPE:
+                    return None
+            try:
+                return int(self._param.get_param_int(name))
+            except ParamError:
+                return None
+
+    def set_parameter(self, name: str, value: float | int) -> str:
+        """Set a parameter; an int is sent as INT32, a float as REAL32. Returns '' where the autopilot has taken
+        it, otherwise the reason.
+        """
+        with self._param_lock:
+            try:
+                if isinstance(value, int):
+                    self._param.set_param_int(name, value)
+                else:
+                    self._param.set_param_float(name, value)
+            except ParamError as error:
+                return error.result.name.lower().replace("_", " ")
+        now = self.parameter(name)
+        if now is None or abs(now - value) > 1e-6 * max(1.0, abs(value)):
+            return f"the autopilot kept {now}"
+        return ""
+
+    def arming_report(self, timeout: float = 2.0) -> ArmingReport | None:
+        """What the autopilot's arming checks say now; None where it does not tell (PX4 before 1.13, others).
+
+        The checks run again for this; the vehicle must be disarmed.
+        """
+        count = self._arming.count
+        refused = self.command(_RUN_PREARM_CHECKS)
+        end = time.monotonic() + timeout
+        while not refused and self._arming.count == count and time.monotonic() < end:
+            time.sleep(0.02)
+        return self._arming.report
+
+    def autopilot_version(self, timeout: float = 1.0) -> str:
+        """Such as 'PX4 1.15.2'; 'unknown' where the autopilot does not tell."""
+        self.command(_REQUEST_MESSAGE, float(_MESSAGE_IDS["AUTOPILOT_VERSION"]))
+        end = time.monotonic() + timeout
+        while not self._version and time.monotonic() < end:
+            time.sleep(0.02)
+        return self._version or "unknown"
+
+    def show_as_ground_station(self) -> None:
+        """One heartbeat of a ground station: PX4 sends STATUSTEXT for some seconds after it.
+
+        Only for a vehicle that does not fly: PX4 then takes us for its data link, and misses us later.
+        """
+        message = MavlinkMessage("HEARTBEAT", fields_json=_GROUND_STATION_HEARTBEAT)
+        self._direct.send_message(message)
 
     # What comes in
 
@@ -321,6 +441,8 @@ class VehicleLink:
         odometry = odometry_from_wire(fields)
         if odometry is not None:
             self.on_odometry(odometry)
+        else:
+            self.on_blind()
 
     def _imu(self, message: MavlinkMessage, _: Any) -> None:
         self._counts["HIGHRES_IMU"] += 1
@@ -343,10 +465,15 @@ class VehicleLink:
             return
         self.latest.heartbeat = 1e-9 * fields["arrived"]
         self.latest.armed = bool(int(fields["base_mode"]) & _ARMED)
+        self.latest.killed = int(fields["system_status"]) == _TERMINATED
+        self.latest.failsafe = int(fields["system_status"]) == _CRITICAL
         self.latest.flight_mode = mode_name(int(fields["custom_mode"]))
         self.on_state()
 
     def _current_mode(self, fields: dict[str, Any]) -> None:
+        # PX4 keeps the mode that somebody chose apart from what its failsafes made of it.
+        intended, mode = int(fields["intended_custom_mode"]), int(fields["custom_mode"])
+        self.latest.failsafe = intended not in (0, mode)
         self.latest.flight_mode = mode_name(int(fields["custom_mode"]))
         self.on_state()
 
@@ -354,7 +481,71 @@ class VehicleLink:
         self.latest.landed = _LANDED.get(int(fields["landed_state"]), "unknown")
 
     def _text(self, fields: dict[str, Any]) -> None:
-        self.latest.texts.append(str(fields["text"]))
+        number, text, texts = int(fields.get("id", 0)), str(fields["text"]).rstrip("\t"), self.latest.texts
+        if texts and number == self._text_number and int(fields.get("chunk_seq", 0)):
+            texts[-1] += text  # a long text comes in pieces
+        else:
+            texts.append(text)
+        self._text_number = number
+
+    def _event(self, fields: dict[str, Any]) -> None:
+        if fields["component"] != _AUTOPILOT or int(fields["sequence"]) == self._event_sequence:
+            return
+        self._event_sequence = int(fields["sequence"])
+        arguments = bytes(int(byte) for byte in fields["arguments"])
+        event = Px4Event(int(fields["id"]), int(fields["log_levels"]) & 0xF, arguments)
+        self._arming.take(event)
+        text = describe(event)
+        if text:
+            self.latest.notices.append((time.monotonic(), text))
+            self.on_notice(text)
+
+    def _autopilot_version(self, fields: dict[str, Any]) -> None:
+        version = int(fields["flight_sw_version"])
+        self._version = f"PX4 {version >> 24 & 0xFF}.{version >> 16 & 0xFF}.{version >> 8 & 0xFF}"
+
+    def _timesync(self, fields: dict[str, Any]) -> None:
+        if fields["component"] != _AUTOPILOT or int(fields["tc1"]):
+            return
+        ours = time.time_ns() - (time.monotonic_ns() - fields["arrived"])
+        answer = f'{{"tc1":{ours},"ts1":{fields["ts1"]},"target_system":{self._system},"target_component":1}}'
+        self._direct.send_message(
+            MavlinkMessage(
+                "TIMESYNC",
+                target_system_id=self._system,
+                target_component_id=_AUTOPILOT,
+                fields_json=answer,
+            )
+        )
+
+    def _estimator(self, fields: dict[str, Any]) -> None:
+        self.latest.position_accuracy = position_accuracy(fields)
+
+    def _system_status(self, fields: dict[str, Any]) -> None:
+        enabled = int(fields["onboard_control_sensors_enabled"])
+        self.latest.unhealthy = unhealthy(enabled, int(fields["onboard_control_sensors_health"]))
+
+
+def vision_estimate(pose: Pose, taken_us: int, reset_counter: int) -> VisionPositionEstimate:
+    """A pose in ENU and FLU as the autopilot wants it: NED, and roll, pitch, yaw of FRD."""
+    north, east, down = (float(x) for x in frames.enu_from_ned(np.array(pose.position)))
+    attitude = frames.enu_flu_from_ned_frd(np.array(pose.quaternion))
+    roll, pitch, yaw = (float(x) for x in frames.euler_from_quaternion(attitude))
+    covariance = [math.nan]
+    if math.isfinite(pose.position_std) and math.isfinite(pose.attitude_std):
+        # The upper right triangle, row by row, of x, y, z, roll, pitch, yaw.
+        covariance = [0.0] * 21
+        for i, std in zip(
+            (0, 6, 11, 15, 18, 20), (pose.position_std,) * 3 + (pose.attitude_std,) * 3, strict=True
+        ):
+            covariance[i] = std * std
+    return VisionPositionEstimate(
+        taken_us,
+        PositionBody(north, east, down),
+        AngleBody(roll, pitch, yaw),
+        Covariance(covariance),
+        reset_counter,
+    )
 
 
 def without_covariance(text: str) -> str:
@@ -372,6 +563,14 @@ def mode_name(custom_mode: int) -> str:
     """PX4's flight mode of a heartbeat, as MAVSDK names it."""
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
     return _MODES.get((main, sub), _MODES.get((main, 0), "UNKNOWN"))
+
+
+def position_accuracy(fields: dict[str, Any]) -> float:
+    """Horizontal accuracy (m) that an ESTIMATOR_STATUS tells; infinite where the estimator has no position."""
+    flags, accuracy = int(fields["flags"]), fields["pos_horiz_accuracy"]
+    if not flags & _POSITION or flags & _HELD or accuracy is None or not math.isfinite(accuracy):
+        return math.inf
+    return float(accuracy)
 
 
 def odometry_from_wire(fields: dict[str, Any]) -> Odometry | None:

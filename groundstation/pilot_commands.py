@@ -407,6 +407,17 @@ def _follow_candidate(
                 return {"state": "staged", "reason": own[-1].text if own else ""}
 
 
+def _mocap(pose: dict[str, Any]) -> str:
+    """Poses that the companion passes on; '' where it expects none."""
+    if not pose:
+        return ""
+    refused = ", ".join(f"{count} {kind}" for kind, count in pose["refused"].items())
+    told = f"{pose['rate']:.0f} Hz, refused: {refused or 'none'}"
+    if pose["latency_ms"]:
+        told += f", {pose['latency_ms']['median']:.1f} ms old when passed on"
+    return told if pose["good"] else f"no good pose; {told}"
+
+
 def status_command(
     config: ConfigOption = None,
     name: NameOption = None,
@@ -454,6 +465,7 @@ def status_command(
         ),
         ("battery", f"{status['battery_voltage']:.2f} V"),
         ("received", rates or "not measured"),
+        ("mocap", escape(_mocap(status.get("pose") or {}))),
         ("live model", escape(titles.get(status["live"], status["live"]))),
         ("in the shadow", escape(waiting)),
         ("last good", escape(titles.get(status["last_good"], status["last_good"]))),

@@ -75,6 +75,7 @@ def key(vehicle: str, leaf: str) -> str:
 
     Leaves: `tick` (protobuf Tick), `event` (protobuf Event), `status` (liveliness token, and a query answered with
     JSON), `mission` (query with JSON), `model` (query, ONNX bytes as payload), `record` (query; JSON list, or the
-    bytes of one record). Queries are answered with JSON `{"accepted": bool, "reason": str, ...}`.
+    bytes of one record), `pose` (put by mocap or vision, JSON: `models.pose`). Queries are answered with JSON
+    `{"accepted": bool, "reason": str, ...}`.
     """
     return f"trueflight/{vehicle}/{leaf}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections import deque
 from enum import IntEnum
 
@@ -29,6 +30,7 @@ _ATTITUDE_STEPS = 2  # attitude loop at 250 Hz, PX4's
 _ESTIMATOR_START = 1.0  # s until the estimator gives a position
 _LANDED_AFTER = 0.5  # s of contact, slow and without thrust
 _EMPTY = 0.05  # state of charge below which arming is denied
+_BATTERY_CRITICAL = 4  # PX4's failsafe_cause_t
 
 
 class Landed(IntEnum):
@@ -54,6 +56,7 @@ class Autopilot:
     """Flies a `Simulator`. Requests come as method calls, `step()` advances by one physics step.
 
     `notices` collects (severity, text) for STATUSTEXT; severities are MAVLink's (3 error, 4 warning, 6 info).
+    `events` collects (PX4's name, severity, arguments) for EVENT.
     `pilot_present` tells whether a radio is on: the pilot's modes and PX4's default reactions need one.
     """
 
@@ -68,6 +71,7 @@ class Autopilot:
         self.pilot_present = False
         self.failsafe = ""
         self.notices: deque[tuple[int, str]] = deque(maxlen=50)
+        self.events: deque[tuple[str, int, bytes]] = deque(maxlen=50)
         self.home: Vector = simulator.estimate().position
         self.thrust = 0.0
         self.rates: Vector = (0.0, 0.0, 0.0)
@@ -177,6 +181,7 @@ class Autopilot:
         refusals = self.arming_refusals()
         if refusals and not (force and not self.killed):
             self.notices.append((3, "Arming denied: " + refusals[0]))
+            self.events.append(("commander_arm_denied_resolve_failures", 2, b""))
             return Verdict.TEMPORARILY_REJECTED
         self.armed = True
         self.armed_us = self.time_us
@@ -203,6 +208,7 @@ class Autopilot:
     def kill(self) -> Verdict:
         """Flight termination: the motors stop at once and stay stopped."""
         self.killed = True
+        self.events.append(("commander_kill_sw_engaged", 4, b""))
         self._stop("Flight termination active")
         return Verdict.ACCEPTED
 
@@ -307,6 +313,7 @@ class Autopilot:
         now = self.time_us
         if self.mode is Mode.OFFBOARD and not self.offboard_alive:
             self._offboard_lost()
+        self._watch_failsafes()
         if self.landed is Landed.ON_GROUND:
             after_flight = self.parameters["COM_DISARM_LAND"]
             before_flight = self.parameters["COM_DISARM_PRFLT"]
@@ -331,6 +338,37 @@ class Autopilot:
         else:
             pilot = {0: Mode.POSCTL, 1: Mode.ALTCTL, 2: Mode.STABILIZED, -1: Mode.POSCTL}
             self._enter({**pilot, 3: Mode.RTL, 4: Mode.LAND, 5: Mode.HOLD}[action])
+
+    def _watch_failsafes(self) -> None:
+        """Geofence and battery, each acting once a flight and only in the air, as PX4's do by their parameters."""
+        if self.landed is Landed.ON_GROUND:
+            return
+        parameters, state = self.parameters, self.simulator.estimate()
+        x, y, z = (now - home for now, home in zip(state.position, self.home, strict=True))
+        across, up = parameters["GF_MAX_HOR_DIST"], parameters["GF_MAX_VER_DIST"]
+        outside = 0.0 < across < math.hypot(x, y) or 0.0 < up < z
+        if outside and self.failsafe != "geofence":
+            self.events.append(("check_gf_violation", 3, struct.pack("<IB", 0xFFFFFFFF, 0)))
+            self._fail(
+                "geofence", {2: Mode.HOLD, 3: Mode.RTL, 5: Mode.LAND}.get(int(parameters["GF_ACTION"])), 0
+            )
+        charge = self.simulator.airframe.battery.charge
+        critical = charge < parameters["BAT_CRIT_THR"]
+        if critical and self.failsafe != "battery":
+            action = int(parameters["COM_LOW_BAT_ACT"])
+            self._fail("battery", {2: Mode.LAND, 3: Mode.RTL}.get(action), _BATTERY_CRITICAL)
+
+    def _fail(self, what: str, mode: Mode | None, cause: int) -> None:
+        """Enter a failsafe's mode (None: warn only) and tell it; the numbers are those of PX4's enumerations."""
+        self.failsafe = what if mode is not None else self.failsafe
+        if mode is None or mode is self.mode:
+            return
+        before = self.mode.custom_mode
+        action = {Mode.HOLD: 5, Mode.RTL: 6, Mode.LAND: 7}[mode]
+        self.notices.append((2, "Failsafe activated"))
+        name = "commander_failsafe_enter" if cause else "commander_failsafe_enter_generic"
+        self.events.append((name, 2, struct.pack("<IBB", before, action, cause)))
+        self._enter(mode)
 
     def _detect_landing(self) -> None:
         world = self.simulator.world

@@ -20,15 +20,22 @@ class Parameter:
 
 
 _TABLE: dict[str, Parameter] = {
+    "BAT_CRIT_THR": Parameter(0.07, 0.05, 0.5),
     "CBRK_SUPPLY_CHK": Parameter(0, 0, 894281),
     "COM_ARM_WO_GPS": Parameter(1, 0, 2),
     "COM_DISARM_LAND": Parameter(2.0, -1.0, 20.0),  # s
     "COM_DISARM_PRFLT": Parameter(10.0, -1.0, 60.0),  # s
     "COM_FLTMODE1": Parameter(-1, -1, 15),
+    "COM_LOW_BAT_ACT": Parameter(0, 0, 3),
     "COM_OBL_RC_ACT": Parameter(0, -1, 7),
     "COM_OF_LOSS_T": Parameter(1.0, 0.0, 60.0),  # s
+    "COM_RCL_EXCEPT": Parameter(0, 0, 31),
     "COM_RC_IN_MODE": Parameter(1, 0, 4),
+    "COM_RC_OVERRIDE": Parameter(1, 0, 3),
     "EKF2_PREDICT_US": Parameter(2000, 1000, 20000),
+    "GF_ACTION": Parameter(2, 0, 5),
+    "GF_MAX_HOR_DIST": Parameter(0.0, 0.0, 10000.0),  # m
+    "GF_MAX_VER_DIST": Parameter(0.0, 0.0, 10000.0),  # m
     "MAV_COMP_ID": Parameter(1, 1, 250),
     "MAV_SYS_ID": Parameter(1, 1, 250),
     "MAV_TYPE": Parameter(2, 0, 22),

@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import common as mav
 
 from sim_bridge.autopilot import Autopilot, Verdict
 from sim_bridge.mavlink import wire
+from sim_bridge.mavlink.event import arming_report
 from sim_bridge.mavlink.peer import Peer
 from sim_bridge.mavlink.telemetry import STREAMS
 from sim_bridge.modes import Mode
@@ -183,6 +184,7 @@ class Commands:
         if command == mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
             return self._requested(mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0, peer)
         if command == mav.MAV_CMD_RUN_PREARM_CHECKS:
+            a.events.extend(arming_report(a.arming_refusals(), a.offboard_alive))
             return Verdict.ACCEPTED, []
         return Verdict.UNSUPPORTED, []
 

@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import common as mav
 from models.errors import InputError
 from sim_bridge.autopilot import Autopilot, Verdict
 from sim_bridge.mavlink.commands import Commands
+from sim_bridge.mavlink.event import Event
 from sim_bridge.mavlink.peer import Address, Peer
 from sim_bridge.mavlink.telemetry import STREAMS
 from sim_bridge.modes import Mode
@@ -111,7 +112,7 @@ class Server:
                 raise
         self.peers: dict[Address, Peer] = {}
         self._add(link.remote, permanent=True)
-        self._notice_id = 0
+        self._notice_id = self._event_number = 0
 
     def close(self) -> None:
         """Release the sockets."""
@@ -201,6 +202,11 @@ class Server:
             del self.peers[address]
         if autopilot.notices:
             self._tell()
+        while autopilot.events:
+            event = Event(*autopilot.events.popleft(), autopilot.time_us // 1000, self._event_number)
+            self._event_number += 1
+            for peer in self.peers.values():
+                self._send(peer, event)
 
     def _tell(self) -> None:
         notices = list(self.autopilot.notices)

@@ -22,7 +22,7 @@ from models import contract
 from models.record_pb2 import Event, Tick
 
 VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
-HEARTBEAT, SET_ATTITUDE_TARGET, ODOMETRY = 0, 82, 331
+HEARTBEAT, SET_ATTITUDE_TARGET, VISION_POSITION_ESTIMATE, ODOMETRY = 0, 82, 102, 331
 PATIENCE = 90.0
 """Seconds after which a test gives up waiting; nothing measured depends on it."""
 
@@ -48,9 +48,9 @@ def wait_for(condition: Callable[[], Any], what: str, patience: float = PATIENCE
 class Process:
     """A child process whose output is kept, and that is ended by its own id."""
 
-    def __init__(self, arguments: Sequence[str]) -> None:
+    def __init__(self, arguments: Sequence[str], extra: dict[str, str] | None = None) -> None:
         self.lines: list[str] = []
-        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", **(extra or {})}
         self.child = subprocess.Popen(
             [sys.executable, *arguments],
             stdout=subprocess.PIPE,
@@ -118,13 +118,15 @@ class Wiretap:
     """Stands on the UDP link between vehicle and companion and notes when which message passes.
 
     `times[message id]` are monotonic seconds; `mode` and `armed` are those of the vehicle's last heartbeat.
-    The vehicle sends to `port`, the companion listens on `companion_port`.
+    The vehicle sends to `port`, the companion listens on `companion_port`. `poses` are the datagrams that carried
+    VISION_POSITION_ESTIMATE.
     """
 
     def __init__(self) -> None:
         self.port, self.companion_port = free_port(), free_port()
         self.times: dict[int, list[float]] = {SET_ATTITUDE_TARGET: [], ODOMETRY: []}
         self.mode, self.armed = "UNKNOWN", False
+        self.poses: list[bytes] = []
         self._vehicle_side = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._vehicle_side.bind(("127.0.0.1", self.port))
         self._companion_side = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -157,6 +159,8 @@ class Wiretap:
                     number = int.from_bytes(datagram[7:10], "little")
                     if number in self.times:
                         self.times[number].append(now)
+                    elif number == VISION_POSITION_ESTIMATE:
+                        self.poses.append(datagram)
                     elif number == HEARTBEAT and side is self._vehicle_side:
                         payload = datagram[10 : 10 + datagram[1]].ljust(9, b"\0")
                         self.mode = mode_name(int.from_bytes(payload[:4], "little"))
@@ -174,7 +178,14 @@ class Wiretap:
 class Companion(Process):
     """`companion run` with a folder of its own, and a ground that talks to it over Zenoh."""
 
-    def __init__(self, folder: Path, mavlink_port: int, *flags: str, before: str = "") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        mavlink_port: int,
+        *flags: str,
+        before: str = "",
+        environment: dict[str, str] | None = None,
+    ) -> None:
         self.records = folder / "records"
         self.zenoh_port = free_port(socket.SOCK_STREAM)
         program = f"{before}\nfrom companion.cli import main; main()"
@@ -189,7 +200,8 @@ class Companion(Process):
                 f"udpin://127.0.0.1:{mavlink_port}",
             ]
             + ["--records", str(self.records), "--models", str(folder / "models")]
-            + ["-l", f"tcp/127.0.0.1:{self.zenoh_port}", *flags]
+            + ["-l", f"tcp/127.0.0.1:{self.zenoh_port}", *flags],
+            environment,
         )
         self.ready()
         config = zenoh.Config()

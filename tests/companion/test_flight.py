@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -247,6 +248,32 @@ def test_an_order_to_land_brings_it_home_or_down_where_it_is() -> None:
         else:
             assert math.dist(after.reference.position, before) < 0.3
         assert rig.flight.outcome == "told to"
+
+
+@pytest.mark.parametrize(("killed", "mode"), [(True, "OFFBOARD"), (False, "TERMINATION")])
+def test_cut_motors_are_the_end_although_the_vehicle_stays_armed(killed: bool, mode: str) -> None:
+    """PX4 stays armed and in Offboard for some seconds after the kill switch: flipped back, motors would turn."""
+    rig = Rig()
+    rig.take_off(fly())
+    rig.until(MISSION)
+    rig.latest.killed, rig.latest.flight_mode = killed, mode
+    assert rig.tick().step is None
+    assert rig.flight.phase == SILENT
+    assert rig.events[-1][0] == "kill_switch"
+    rig.latest.killed, rig.latest.flight_mode = False, "OFFBOARD"
+    assert all(out.step is None for out in rig.run(1.0)), "and it never comes back"
+
+
+def test_a_failsafe_is_told_apart_from_a_pilot_and_with_its_reason() -> None:
+    rig = Rig()
+    rig.take_off(fly())
+    rig.until(MISSION)
+    rig.latest.notices.append((time.monotonic(), "failsafe: battery critical, Land"))
+    rig.latest.failsafe, rig.latest.flight_mode = True, "LAND"
+    assert rig.tick().step is None
+    kind, text = rig.events[-1]
+    assert kind == "failsafe"
+    assert "battery critical" in text
 
 
 def test_disarmed_in_flight_is_the_end() -> None:

@@ -1,0 +1,243 @@
+"""`companion preflight`, `doctor` and `install-service`: before the first flight, and before every flight."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TextColumn
+
+from models.errors import InputError
+
+if TYPE_CHECKING:
+    from companion.pose import PoseFeed
+    from companion.settings import Settings
+    from companion.vehicle_link import VehicleLink
+    from models.vehicle import Vehicle
+
+console = Console()
+_FAILED = 2
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+ConfigOption = Annotated[Path | None, typer.Option(help="Configuration (companion.toml); flags override it.")]
+VehicleOption = Annotated[Path | None, typer.Option(help="Vehicle file (vehicle.toml).")]
+ConnectOption = Annotated[
+    str | None,
+    typer.Option(help="MAVSDK address of the autopilot, such as udpin://127.0.0.1:14540 or serial://..."),
+]
+RateOption = Annotated[float | None, typer.Option(help="Control rate, Hz: the odometry's.")]
+TimeoutOption = Annotated[float | None, typer.Option(help="Seconds to wait for an autopilot.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the companion's application."""
+    app.command(
+        "preflight",
+        epilog="Example: companion preflight --vehicle vehicle.toml --connect serial:///dev/ttyAMA0:921600",
+    )(preflight_command)
+    app.command("doctor", epilog="Example: companion doctor --config /etc/trueflight/companion.toml --json")(
+        doctor_command
+    )
+    app.command(
+        "install-service",
+        epilog="Example: sudo companion install-service --vehicle vehicle.toml "
+        "--connect serial:///dev/ttyAMA0:921600",
+    )(install_command)
+
+
+def preflight_command(
+    config: ConfigOption = None,
+    vehicle: VehicleOption = None,
+    connect: ConnectOption = None,
+    rate: RateOption = None,
+    timeout: TimeoutOption = None,
+    records: Annotated[
+        Path | None, typer.Option(help="Folder of the flight records: hover thrust is learned from them.")
+    ] = None,
+    set_parameters: Annotated[
+        bool, typer.Option("--set-params", help="Set the parameters that are not as they should be.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Ask the autopilot what stands against a flight: arming checks, parameters, rates, hover thrust.
+
+    Nothing is changed without `--set-params`. While it runs it shows itself as a ground station, so that older
+    PX4 tells its reasons; run it on the ground, disarmed. Exit code 2 where a flight would be refused or end badly.
+    """
+    from companion import preflight
+    from companion.findings import table_of
+    from companion.vehicle_link import VehicleLink
+    from models.vehicle import load_vehicle
+
+    settings = _settings(config, vehicle, connect, rate, timeout, records)
+    believed = load_vehicle(settings.vehicle) if settings.vehicle else None
+    link = VehicleLink(settings.connect, settings.timeout)
+    changed: list[str] = []
+    try:
+        with _progress(as_json) as tell, _poses(settings, believed, link) as pose:
+            report = preflight.look(link, settings, believed, tell, pose)
+            if set_parameters:
+                tell("setting parameters")
+                changed = preflight.set_parameters(link, [*report.parameters, *report.hover])
+                if changed:
+                    report = preflight.look(link, settings, believed, tell, pose)
+    finally:
+        link.close()
+    if as_json:
+        typer.echo(json.dumps({**preflight.as_json(report), "changed": changed}))
+    else:
+        console.print(f"{report.autopilot} on {escape(settings.connect)}")
+        console.print(table_of("Arming", report.arming, "what to do"))
+        console.print(table_of("Parameters", report.parameters))
+        console.print(table_of("Message rates", report.rates))
+        console.print(table_of("Hover thrust", report.hover))
+        for line in changed:
+            console.print(escape(line), highlight=False)
+        open_changes = [p.name for p in (*report.parameters, *report.hover) if p.change is not None]
+        if open_changes and not set_parameters:
+            console.print(f"--set-params would set: {', '.join(open_changes)}")
+        console.print(
+            "[green]ready for a flight[/]" if report.ready else "[bold red]not ready for a flight[/]"
+        )
+    raise typer.Exit(0 if report.ready else _FAILED)
+
+
+def doctor_command(
+    config: ConfigOption = None,
+    vehicle: VehicleOption = None,
+    connect: ConnectOption = None,
+    rate: RateOption = None,
+    timeout: TimeoutOption = None,
+    root: Annotated[Path, typer.Option(help="Where the system's files are.", hidden=True)] = Path("/"),
+    as_json: JsonOption = False,
+) -> None:
+    """Examine this machine: serial port, rates, clock, disk, processor, Zenoh endpoints, model.
+
+    Says what to do about what it finds and changes nothing. Exit code 2 where something would keep a vehicle
+    from flying.
+    """
+    from companion import doctor
+    from companion.findings import FAIL, rows_of, table_of
+
+    settings = _settings(config, vehicle, connect, rate, timeout, None)
+    with _progress(as_json) as tell:
+        findings = doctor.examine(settings, root, tell)
+    failed = [finding for finding in findings if finding.state == FAIL]
+    if as_json:
+        typer.echo(json.dumps({"ready": not failed, "findings": rows_of(findings)}))
+    else:
+        console.print(table_of("This machine", findings, "what to do"))
+        told = (
+            f"[bold red]{len(failed)} to mend before a flight[/]"
+            if failed
+            else "[green]nothing against a flight[/]"
+        )
+        console.print(told)
+    raise typer.Exit(_FAILED if failed else 0)
+
+
+def install_command(
+    vehicle: Annotated[Path, typer.Option(help="Vehicle file (vehicle.toml).")],
+    design: Annotated[
+        Path | None, typer.Option(help="Design file; otherwise design.json beside the vehicle.")
+    ] = None,
+    connect: Annotated[
+        str, typer.Option(help="MAVSDK address of the autopilot.")
+    ] = "serial:///dev/ttyAMA0:921600",
+    listen: Annotated[str, typer.Option(help="Zenoh endpoint for the ground.")] = "tcp/0.0.0.0:7447",
+    user: Annotated[str, typer.Option(help="User that the companion runs as.")] = "trueflight",
+    realtime: Annotated[int, typer.Option(help="Priority of the control thread, 0 for none.")] = 20,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Root that the files are put below.")] = Path(
+        "/"
+    ),
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the files and write nothing.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a systemd unit, its user and a commented configuration; print what to do next.
+
+    The unit restarts the companion, watches its control tick, runs it as a user of its own and lets the control
+    thread ask for a real-time priority. A file that you have changed is kept, and the new one put beside it.
+    """
+    from companion.service import Service, install, next_steps, texts
+
+    beside = design if design is not None else vehicle.with_name("design.json")
+    service = Service(vehicle, beside, connect, user, listen, realtime)
+    done = install(service, output, dry_run)
+    if as_json:
+        files = {str(path): state for path, state in done}
+        typer.echo(json.dumps({"files": files, "next": list(next_steps(service)), "dry_run": dry_run}))
+        return
+    if dry_run:
+        for name, text in texts(service).items():
+            console.print(f"[bold]# {escape(str(output / name))}[/]")
+            console.print(escape(text), highlight=False, soft_wrap=True)
+    for path, state in done:
+        console.print(f"{escape(str(path))}: {'would be ' * dry_run}{state}", highlight=False, soft_wrap=True)
+    if output == Path("/"):
+        console.print("next:")
+        for step in next_steps(service):
+            console.print(f"  {step}", highlight=False, soft_wrap=True)
+
+
+def _settings(
+    config: Path | None,
+    vehicle: Path | None,
+    connect: str | None,
+    rate: float | None,
+    timeout: float | None,
+    records: Path | None,
+) -> Settings:
+    from companion.settings import load_settings
+
+    settings = load_settings(config)
+    given: dict[str, Any] = {"vehicle": vehicle, "connect": connect, "records": records}
+    flags: dict[str, Any] = {name: str(value) for name, value in given.items() if value is not None}
+    flags |= {name: value for name, value in (("rate", rate), ("timeout", timeout)) if value is not None}
+    settings = replace(settings, **flags)
+    if not 10.0 <= settings.rate <= 1000.0:
+        raise InputError(f"rate = {settings.rate:g} is outside 10 to 1000 Hz")
+    settings.pose.checked()
+    return settings
+
+
+@contextmanager
+def _poses(settings: Settings, vehicle: Vehicle | None, link: VehicleLink) -> Iterator[PoseFeed | None]:
+    """Mocap poses passed on meanwhile, where the configuration wants them: the estimator has no position without."""
+    if not settings.pose.enabled:
+        yield None
+        return
+    if vehicle is None:
+        raise InputError("[pose] is enabled: pass --vehicle, whose name is in the key of the poses")
+    from companion.pose import PoseFeed
+    from companion.zenoh_session import open_session
+    from models.contract import key
+
+    session = open_session(settings.zenoh)
+    feed = PoseFeed(settings.pose, link.send_pose, lambda level, kind, text: None)
+    try:
+        link.share_clock()
+        subscriber = session.declare_subscriber(
+            key(vehicle.name, "pose"), lambda sample: feed.take(sample.payload.to_bytes())
+        )
+        yield feed
+        subscriber.undeclare()
+    finally:
+        feed.close()
+        session.close()
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Any]:
+    """A line that tells what is being looked at, on a terminal that people see."""
+    errors = Console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=errors, transient=True, disable=quiet or not errors.is_terminal) as bar:
+        task = bar.add_task("looking", total=None)
+        yield lambda what: bar.update(task, description=f"looking at {what}")

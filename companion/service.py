@@ -1,0 +1,195 @@
+"""`companion install-service`: a systemd unit, its user and a commented configuration, as files below a folder.
+
+A file that somebody has changed since is never overwritten: each carries the hash of what was written, and where that
+no longer holds, the new one is put beside it as `NAME.new`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from models.errors import InputError
+from models.vehicle import load_vehicle
+
+UNIT = "etc/systemd/system/trueflight-companion.service"
+SYSUSERS = "etc/sysusers.d/trueflight.conf"
+FOLDER = "etc/trueflight"
+CONFIG = f"{FOLDER}/companion.toml"
+STATE = "/var/lib/trueflight"
+WATCHDOG = 5
+"""Seconds without a control tick after which systemd restarts the companion: on the ground, for in the air the
+autopilot has taken over long before."""
+
+_MARK = "# Written by companion install-service; sha256 of what follows: "
+_NAME = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
+
+NEW, SAME, UPDATED, KEPT = "new", "unchanged", "updated", "kept, yours has changes; the new one is beside it"
+
+
+@dataclass(frozen=True)
+class Service:
+    """What the service is to be: files of the vehicle, address of the autopilot, user, program, priority."""
+
+    vehicle: Path
+    design: Path
+    connect: str
+    user: str = "trueflight"
+    listen: str = "tcp/0.0.0.0:7447"
+    realtime: int = 20
+    program: str = ""
+
+    def checked(self) -> Service:
+        """The same, or `InputError` for what a unit must not hold."""
+        if not _NAME.fullmatch(self.user):
+            raise InputError(f"--user '{self.user}' is no name of a user; small letters, digits, - and _")
+        if self.user == "root":
+            raise InputError(
+                "--user root: the companion needs no such rights; leave it, or name another user"
+            )
+        if not 0 <= self.realtime <= 80:
+            raise InputError(f"--realtime {self.realtime} is outside 0 (off) to 80")
+        if not re.fullmatch(r"[\x21-\x7e]+", self.connect):
+            raise InputError(f"--connect '{self.connect}' holds blanks or control characters")
+        load_vehicle(self.vehicle)
+        if not self.design.is_file():
+            raise InputError(
+                f"{self.design}: no design file; make it with groundstation design, or pass --design"
+            )
+        return self
+
+    @property
+    def command(self) -> str:
+        """The program that the unit starts."""
+        beside = Path(sys.executable).with_name("companion")
+        return self.program or (str(beside) if beside.is_file() else f"{sys.executable} -m companion.cli")
+
+
+def texts(service: Service) -> dict[str, str]:
+    """Path below the root to the text of each file, without its mark."""
+    home = "read-only" if service.command.startswith(("/home", "/root")) else "yes"
+    unit = f"""\
+[Unit]
+Description=trueflight companion: flies the vehicle beside its autopilot
+After=network.target time-sync.target
+# Tries for ever: the autopilot may be switched on an hour later.
+StartLimitIntervalSec=0
+
+[Service]
+Type=notify
+NotifyAccess=main
+ExecStart={service.command} run --config /{CONFIG}
+User={service.user}
+SupplementaryGroups=dialout
+StateDirectory={Path(STATE).name}
+WorkingDirectory={STATE}
+
+# A companion that comes back in flight sends nothing: the vehicle is its autopilot's until it has landed.
+Restart=always
+RestartSec=2
+# Fed by the control tick alone: no odometry, or a control thread that hangs, for so long means a new start.
+WatchdogSec={WATCHDOG}
+TimeoutStartSec=120
+# On SIGTERM in flight it lets the autopilot land first.
+TimeoutStopSec=120
+
+# What the control thread may ask for; how much it does stands in the configuration (realtime).
+LimitRTPRIO={service.realtime}
+OOMScoreAdjust=-500
+LimitCORE=0
+Environment=OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
+
+NoNewPrivileges=yes
+ProtectSystem=strict
+ProtectHome={home}
+PrivateTmp=yes
+ProtectKernelTunables=yes
+ProtectControlGroups=yes
+
+[Install]
+WantedBy=multi-user.target
+"""
+    sysusers = f"""\
+u {service.user} - "trueflight companion" {STATE}
+m {service.user} dialout
+"""
+    values = {
+        "vehicle": json.dumps(f"/{FOLDER}/vehicle.toml"),
+        "design": json.dumps(f"/{FOLDER}/design.json"),
+        "connect": json.dumps(service.connect),
+        "realtime": str(service.realtime),
+        "records": json.dumps(f"{STATE}/records"),
+        "models": json.dumps(f"{STATE}/deployed"),
+        "listen": json.dumps([service.listen]),
+    }
+    return {UNIT: unit, SYSUSERS: sysusers, CONFIG: _configured(values)}
+
+
+def _configured(values: dict[str, str]) -> str:
+    """The commented example with these values; comments stay where they are."""
+    text = Path(__file__).with_name("companion.toml").read_text(encoding="utf-8")
+    for key, value in values.items():
+        line = f"{key} = {value} ".ljust(38)
+        pattern = rf"^(?:# )?{key} = [^#\n]*"
+        text, count = re.subn(pattern, line.replace("\\", r"\\"), text, count=1, flags=re.MULTILINE)
+        assert count == 1, key
+    return re.sub(r"[ ]+$", "", text, flags=re.MULTILINE)
+
+
+def install(service: Service, root: Path, dry_run: bool = False) -> list[tuple[Path, str]]:
+    """Write the files below `root`; each path with what was done (or would be, on a `dry_run`).
+
+    Raises `InputError` where something cannot be written; a file is either whole or as it was.
+    """
+    service = service.checked()
+    files = {name: text.encode() for name, text in texts(service).items()}
+    done = [(root / name, _put(root / name, text, dry_run, marked=True)) for name, text in files.items()]
+    for source, name in ((service.vehicle, "vehicle.toml"), (service.design, "design.json")):
+        path = root / FOLDER / name
+        done.append((path, _put(path, source.read_bytes(), dry_run, marked=False)))
+    return done
+
+
+def _put(path: Path, text: bytes, dry_run: bool, marked: bool) -> str:
+    whole = _MARK.encode() + hashlib.sha256(text).hexdigest().encode() + b"\n" + text if marked else text
+    try:
+        there = path.read_bytes() if path.exists() else None
+        if there == whole:
+            return SAME
+        state = NEW if there is None else UPDATED if marked and _untouched(there) else KEPT
+        if not dry_run:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            target = path if state != KEPT else path.with_name(path.name + ".new")
+            part = target.with_name(target.name + ".part")
+            part.write_bytes(whole)
+            part.chmod(0o644)
+            part.replace(target)
+        return state
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot write it ({error.strerror}); use sudo, or --output FOLDER"
+        ) from None
+
+
+def _untouched(there: bytes) -> bool:
+    """Whether a file is as it was once written by us."""
+    first, _, rest = there.partition(b"\n")
+    return first == _MARK.encode() + hashlib.sha256(rest).hexdigest().encode()
+
+
+def next_steps(service: Service) -> Iterator[str]:
+    """The commands that make a service of the files, and the first things to look at."""
+    if shutil.which("systemd-sysusers") or Path("/run/systemd/system").exists():
+        yield "sudo systemd-sysusers                                   # makes the user"
+    else:
+        yield f"sudo useradd --system --groups dialout {service.user}"
+    yield "sudo systemctl daemon-reload"
+    yield f"companion doctor --config /{CONFIG}"
+    yield "sudo systemctl enable --now trueflight-companion"
+    yield "journalctl -u trueflight-companion -f"
