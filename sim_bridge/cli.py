@@ -211,9 +211,9 @@ def sitl(
 ) -> None:
     """Be the simulator of a real PX4 (SITL): the same vehicle, world and hidden effects as `run`, flown by PX4 itself.
 
-    PX4 connects to a TCP port and both advance in lockstep: its clock is simulated time. Start PX4 in a working folder of
-    its own with PX4_SIM_MODEL=none_iris. Before it arms, its control allocation is compared with the vehicle file; a
-    difference ends with exit code 2. docs/px4.md tells the whole way.
+    PX4 connects to a TCP port and both advance in lockstep: its clock is simulated time. Start PX4 in a working
+    folder of its own with PX4_SIM_MODEL=none_iris. Before it arms, its control allocation is compared with the vehicle
+    file; a difference ends with exit code 2. docs/px4.md tells the whole way.
     """
     names = (
         "vehicle",

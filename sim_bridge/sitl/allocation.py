@@ -44,7 +44,7 @@ def expected_parameters(vehicle: Vehicle) -> list[Expected]:
 
 
 def differences(vehicle: Vehicle, values: Mapping[str, int | float]) -> list[str]:
-    """What differs between PX4's control allocation (`values` by parameter name) and the vehicle's; empty if nothing does.
+    """What differs between PX4's control allocation (`values` by name) and the vehicle's; empty if nothing does.
 
     PX4 normalises the mixer: arms may be longer or shorter by one common factor, and moments too. Raises `InputError`
     where a value is missing.

@@ -29,8 +29,8 @@ class State(Enum):
 class AllocationCheck:
     """Reads what PX4 has, compares, and sets it where that is asked for (`correct`). Called with PX4's clock.
 
-    `notes` collects lines for the user. Where `battery` is given and PX4's own battery simulator is off, PX4 is told the true
-    battery.
+    `notes` collects lines for the user. Where `battery` is given and PX4's own battery simulator is off, PX4 is told
+    the true battery.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class AllocationCheck:
             raise InputError(f"PX4 flies another vehicle: {found[0]}{more}; {advice}")
         self._tries += 1
         for one in self._expected:
-            if values[one.name] != one.value:
+            if abs(values[one.name] - one.value) > 1e-6:
                 self._link.set(one.name, one.value)
                 self.changed.append(one.name)
         if abs(values[HOVER] - self.vehicle.hover_thrust) > 1e-3:
@@ -102,7 +102,8 @@ class AllocationCheck:
             )
         if values[BATTERY_SIMULATOR] != 0:
             self.notes.append(
-                f"PX4 simulates a battery of its own; for the vehicle's: param set {BATTERY_SIMULATOR} 0, and start PX4 again"
+                f"PX4 simulates a battery of its own; for the vehicle's: param set {BATTERY_SIMULATOR} 0, and start "
+                "PX4 again"
             )
 
     def _give_up(self) -> None:

@@ -78,8 +78,8 @@ class Offer:
 
 @dataclass
 class Progress:
-    """Where a flight is. `simulated` and `wall` in s since the connection; `late` counts steps without an answer in time,
-    `airborne` whether the vehicle is off the ground; `answer_times` in s of wall time, of the last steps.
+    """Where a flight is. `simulated` and `wall` in s since the connection; `late` counts steps without an answer in
+    time; `airborne` tells whether the vehicle is off the ground; `answer_times` in s of wall time, of the last steps.
     """
 
     simulated: float = 0.0
@@ -179,9 +179,9 @@ class Lockstep:
             if not complaint:
                 self._client = client
                 return running()
-            client.close()
             if running():
                 self._tell(f"{self.peer} was sent away: {complaint}; still waiting for PX4")
+            client.close()
         return False
 
     def _greet(self, client: socket.socket, running: Callable[[], bool]) -> str:
@@ -407,8 +407,8 @@ class Lockstep:
         if armed and any(abs(value) > 1e-6 for value in outputs[4:]):
             extra = [i + 1 for i in range(4, len(outputs)) if abs(outputs[i]) > 1e-6]
             raise InputError(
-                f"PX4 drives output {extra[0]}, the vehicle file has 4 rotors: the airframe is another one; start PX4 with "
-                "PX4_SIM_MODEL=none_iris"
+                f"PX4 drives output {extra[0]}, the vehicle file has 4 rotors: the airframe is another one; start PX4 "
+                "with PX4_SIM_MODEL=none_iris"
             )
         a, b, c, d = (min(max(value, 0.0), 1.0) if value == value else 0.0 for value in outputs[:4])
         self._motors = (a, b, c, d)

@@ -1,4 +1,4 @@
-"""A second, thin MAVLink connection to the PX4 that is being simulated: its parameters, and the battery's state to it."""
+"""A second, thin MAVLink connection to the PX4 that is simulated: its parameters, and the battery's state to it."""
 
 from __future__ import annotations
 

@@ -48,8 +48,8 @@ class RawNoise:
     vision_attitude: float = 0.002  # rad
 
     def times(self, factor: float) -> RawNoise:
-        """The same noise, louder or quieter. The IMU, magnetometer and barometer keep a digit of noise even at 0: PX4 takes a
-        sensor that repeats itself for a dead one.
+        """The same noise, louder or quieter. IMU, magnetometer and barometer keep a digit of it even at 0: PX4 takes
+        a sensor that repeats itself for a dead one.
         """
         scaled = {f.name: factor * getattr(self, f.name) for f in fields(self) if f.name != "gps_wander_time"}
         for name, digit in _DIGITS.items():
@@ -91,7 +91,7 @@ class Vision(NamedTuple):
 
 
 def specific_force(acceleration: Vector, rotation: tuple[float, ...]) -> Vector:
-    """What an ideal accelerometer reads, m/s², FLU, at an acceleration (m/s², ENU); `rotation` body to world, by rows."""
+    """What an ideal accelerometer reads, m/s², FLU, at an acceleration (m/s², ENU); `rotation` body to world."""
     ax, ay, az = acceleration
     az += GRAVITY
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
@@ -124,7 +124,7 @@ def pressure_altitude(hectopascal: float) -> float:
 
 
 class RawSensors:
-    """Draws the errors of every sample from one seeded generator; `accelerometer_bias` (m/s², FLU) is a hidden effect."""
+    """Draws the errors of every sample from one seeded generator; `accelerometer_bias` (m/s², FLU) is hidden."""
 
     def __init__(self, noise: RawNoise, seed: int, accelerometer_bias: Vector = (0.0, 0.0, 0.0)) -> None:
         self.noise = noise

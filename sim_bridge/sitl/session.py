@@ -62,7 +62,8 @@ def check_hidden(hidden: tuple[Hidden, ...]) -> None:
     for one in hidden:
         if one.name in _INSIDE:
             raise InputError(
-                f"--hidden: '{one.name}' {_INSIDE[one.name]}, and here PX4 flies; hide another effect or draw with another seed"
+                f"--hidden: '{one.name}' {_INSIDE[one.name]}, and here PX4 flies; hide another effect or draw with "
+                "another seed"
             )
 
 
@@ -138,8 +139,8 @@ def fly(
 ) -> None:
     """Simulate for one PX4 until it goes, or the user stops, or the duration is over.
 
-    `seal` writes the sealed answer once nothing can fail any more, `told` says what is hidden. Raises `InputError` for what
-    cannot be simulated, for another vehicle in PX4, and for a PX4 that vanishes in flight.
+    `seal` writes the sealed answer once nothing can fail any more, `told` says what is hidden. Raises `InputError` for
+    what cannot be simulated, for another vehicle in PX4, and for a PX4 that vanishes in flight.
     """
     check_hidden(hidden)
     simulator = Simulator(vehicle, hidden, settings.seed, settings.sensor_noise, settings.battery)
@@ -210,7 +211,8 @@ class _Watch:
             state = "armed" if progress.armed else "disarmed"
             height = self._lockstep.simulator.world.position[2]
             self._teller.live(
-                f"{progress.simulated:.0f} s, {progress.times_real_time:.2f} times real time, {state}, height {height:.1f} m"
+                f"{progress.simulated:.0f} s, {progress.times_real_time:.2f} times real time, {state}, "
+                f"height {height:.1f} m"
             )
 
     def _align(self, check: AllocationCheck, time_us: int) -> None:
@@ -244,12 +246,15 @@ def _conclude(ending: Ending, progress: Progress, check: AllocationCheck | None,
     else:
         times = np.array(progress.answer_times) * 1e3
         hint = (
-            f"; {progress.answers} steps answered in {np.median(times):.2f} ms (median), {np.percentile(times, 99):.1f} ms "
-            f"(99 %), {progress.late} late"
+            f"; {progress.answers} steps answered in {np.median(times):.2f} ms (median), "
+            f"{np.percentile(times, 99):.1f} ms (99 %), {progress.late} late"
             if len(times)
             else ""
         )
-    text = f"{ending.value} after {progress.simulated:.1f} s of simulated time, {progress.times_real_time:.2f} times real time{hint}"
+    text = (
+        f"{ending.value} after {progress.simulated:.1f} s of simulated time, "
+        f"{progress.times_real_time:.2f} times real time{hint}"
+    )
     if ending is not Ending.STOPPED and progress.armed and progress.airborne:
         raise InputError(f"{text}; it was armed and in the air. Start both again: PX4 does not reconnect")
     teller.tell(
