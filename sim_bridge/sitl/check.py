@@ -12,10 +12,16 @@ from sim_bridge.truth.battery import Battery
 
 _PATIENCE_US = 20_000_000  # of PX4's clock, from its first stream on
 _ATTEMPTS = 3
+_OPTIONAL_US = 2_000_000  # for what not every PX4 has
 _BATTERY_EVERY_US = 500_000
 _HOVER_TOLERANCE = 0.05
 
-BATTERY_SIMULATOR, HOVER = "SIM_BAT_ENABLE", "MPC_THR_HOVER"
+HOVER = "MPC_THR_HOVER"
+_SIMULATED, _FLIGHT_TIME = "SIM_BAT_ENABLE", "COM_FLTT_LOW_ACT"
+OWN_BATTERY = {_SIMULATED: 0, _FLIGHT_TIME: 0}
+"""What PX4 needs to fly on the vehicle's battery: no simulated one of its own, and no return for want of flight time
+(PX4 takes a MAVLink battery's remaining time for 0 s and would leave Offboard at once).
+"""
 
 
 class State(Enum):
@@ -45,7 +51,9 @@ class AllocationCheck:
         self._tries = 0
         self._begin_us: int | None = None
         self._battery_us = 0
-        link.ask([one.name for one in self._expected] + [BATTERY_SIMULATOR, HOVER])
+        self._needed = [*(one.name for one in self._expected), HOVER]
+        self._complete_us: int | None = None
+        link.ask([*self._needed, *OWN_BATTERY])
 
     def step(self, now_us: int) -> None:
         """Go on with the check, and tell PX4 the battery. Raises `InputError` where PX4 flies another vehicle."""
@@ -53,17 +61,23 @@ class AllocationCheck:
         if self._begin_us is None:
             self._begin_us = now_us
         if self.state is State.WAITING:
-            if self._link.complete:
-                self._compare()
+            if self._link.has(self._needed):
+                self._complete_us = now_us if self._complete_us is None else self._complete_us
+                if self._link.has(OWN_BATTERY) or now_us - self._complete_us > _OPTIONAL_US:
+                    self._compare()
             elif now_us - self._begin_us > _PATIENCE_US:
                 self._give_up()
-        elif self._feeds_battery and now_us >= self._battery_us and self._battery is not None:
+        elif self.state is State.AGREES and self._battery is not None and now_us >= self._battery_us:
+            if not self._feeds_battery:
+                return
             self._battery_us = now_us + _BATTERY_EVERY_US
             self._link.tell_battery(self._battery)
 
     @property
     def _feeds_battery(self) -> bool:
-        return self.state is State.AGREES and self._link.values.get(BATTERY_SIMULATOR) == 0
+        values = self._link.values
+        own = values.get(_SIMULATED) == 0 and _SIMULATED not in self.changed  # PX4 reads it when it starts
+        return own and values.get(_FLIGHT_TIME, 0) == 0
 
     def rows(self) -> list[tuple[Expected, int | float | None]]:
         """Every parameter with what PX4 has (None: not told)."""
@@ -72,7 +86,7 @@ class AllocationCheck:
     def _compare(self) -> None:
         values = self._link.values
         found = differences(self.vehicle, values)
-        if not found:
+        if not found and not (self._correct and self._tries == 0 and self._beside()):
             self.state = State.AGREES
             self._remark()
             return
@@ -87,11 +101,20 @@ class AllocationCheck:
         self._tries += 1
         for one in self._expected:
             if abs(values[one.name] - one.value) > 1e-6:
-                self._link.set(one.name, one.value)
-                self.changed.append(one.name)
-        if abs(values[HOVER] - self.vehicle.hover_thrust) > 1e-3:
-            self._link.set(HOVER, self.vehicle.hover_thrust)
-            self.changed.append(HOVER)
+                self._set(one.name, one.value)
+        for name, value in self._beside().items():
+            self._set(name, value)
+
+    def _beside(self) -> dict[str, float]:
+        """What else differs and is set where that is asked for: hover thrust, and whose battery it is."""
+        wanted = {HOVER: self.vehicle.hover_thrust, **OWN_BATTERY}
+        values = self._link.values
+        return {name: wish for name, wish in wanted.items() if abs(values.get(name, wish) - wish) > 1e-3}
+
+    def _set(self, name: str, value: float) -> None:
+        self._link.set(name, value)
+        if name not in self.changed:
+            self.changed.append(name)
 
     def _remark(self) -> None:
         values = self._link.values
@@ -100,10 +123,12 @@ class AllocationCheck:
                 f"{HOVER} is {values[HOVER]:.3g} in PX4, hover_thrust {self.vehicle.hover_thrust:.3g} in the vehicle "
                 "file: PX4's own modes will start with the wrong thrust"
             )
-        if values[BATTERY_SIMULATOR] != 0:
+        if _SIMULATED in self.changed:
+            self.notes.append(f"PX4 flies on a battery of its own until it is started again ({_SIMULATED})")
+        elif not self._feeds_battery:
+            commands = ", ".join(f"param set {name} {value}" for name, value in OWN_BATTERY.items())
             self.notes.append(
-                f"PX4 simulates a battery of its own; for the vehicle's: param set {BATTERY_SIMULATOR} 0, and start "
-                "PX4 again"
+                f"PX4 flies on a battery of its own; for the vehicle's: {commands}; start PX4 again"
             )
 
     def _give_up(self) -> None:

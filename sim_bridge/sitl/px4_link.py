@@ -74,10 +74,9 @@ class Px4Link:
         for name in self._wanted:
             self.values.pop(name, None)
 
-    @property
-    def complete(self) -> bool:
-        """Whether all that was asked for is there."""
-        return all(name in self.values for name in self._wanted)
+    def has(self, names: Iterable[str]) -> bool:
+        """Whether PX4 has told all of these."""
+        return all(name in self.values for name in names)
 
     def poll(self, now_us: int) -> None:
         """Take what has come, and ask again for what is missing; `now_us` is the vehicle's clock."""

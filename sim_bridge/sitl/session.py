@@ -22,7 +22,7 @@ from models.vehicle import Vehicle
 from sim_bridge.settings import Settings
 from sim_bridge.simulator import Simulator
 from sim_bridge.sitl.allocation import expected_parameters
-from sim_bridge.sitl.check import BATTERY_SIMULATOR, HOVER, AllocationCheck, State
+from sim_bridge.sitl.check import HOVER, OWN_BATTERY, AllocationCheck, State
 from sim_bridge.sitl.lockstep import Ending, Lockstep, Offer, Position, Progress, listen
 from sim_bridge.sitl.px4_link import PAYLOAD_PORT, Px4Link
 from sim_bridge.sitl.sensors import RawNoise, RawSensors
@@ -81,7 +81,8 @@ def parameter_table(vehicle: Vehicle, values: dict[str, int | float] | None = No
 def parameter_lines(vehicle: Vehicle) -> list[str]:
     """The commands of PX4's shell (or lines of its `px4-rc.params`) that make its control allocation the vehicle's."""
     lines = [f"param set {one.name} {one.value:.6g}" for one in expected_parameters(vehicle)]
-    return [*lines, f"param set {HOVER} {vehicle.hover_thrust:.6g}", f"param set {BATTERY_SIMULATOR} 0"]
+    lines.append(f"param set {HOVER} {vehicle.hover_thrust:.6g}")
+    return lines + [f"param set {name} {value}" for name, value in OWN_BATTERY.items()]
 
 
 class Teller:

@@ -36,7 +36,7 @@ IRIS = {
     **{"CA_ROTOR1_PX": -0.1515, "CA_ROTOR1_PY": -0.1875, "CA_ROTOR1_KM": 0.05},
     **{"CA_ROTOR2_PX": 0.1515, "CA_ROTOR2_PY": -0.245, "CA_ROTOR2_KM": -0.05},
     **{"CA_ROTOR3_PX": -0.1515, "CA_ROTOR3_PY": 0.1875, "CA_ROTOR3_KM": -0.05},
-    **{"SIM_BAT_ENABLE": 1, "MPC_THR_HOVER": 0.5},
+    **{"SIM_BAT_ENABLE": 1, "COM_FLTT_LOW_ACT": 3, "MPC_THR_HOVER": 0.5},
 }
 """What PX4 1.15 has with PX4_SIM_MODEL=none_iris."""
 
