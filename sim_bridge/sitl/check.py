@@ -18,9 +18,10 @@ _HOVER_TOLERANCE = 0.05
 
 HOVER = "MPC_THR_HOVER"
 _SIMULATED, _FLIGHT_TIME = "SIM_BAT_ENABLE", "COM_FLTT_LOW_ACT"
-OWN_BATTERY = {_SIMULATED: 0, _FLIGHT_TIME: 0}
+OWN_BATTERY = {_SIMULATED: 0, _FLIGHT_TIME: 1}
 """What PX4 needs to fly on the vehicle's battery: no simulated one of its own, and no return for want of flight time
-(PX4 takes a MAVLink battery's remaining time for 0 s and would leave Offboard at once).
+(PX4 takes a MAVLink battery's remaining time for 0 s; with 0, no action, PX4 1.15 leaves Offboard for Hold all the
+same, with 1 it warns).
 """
 
 
@@ -77,7 +78,7 @@ class AllocationCheck:
     def _feeds_battery(self) -> bool:
         values = self._link.values
         own = values.get(_SIMULATED) == 0 and _SIMULATED not in self.changed  # PX4 reads it when it starts
-        return own and values.get(_FLIGHT_TIME, 0) == 0
+        return own and values.get(_FLIGHT_TIME, 1) == 1
 
     def rows(self) -> list[tuple[Expected, int | float | None]]:
         """Every parameter with what PX4 has (None: not told)."""
