@@ -235,13 +235,13 @@ def sitl(
     from sim_bridge.world import check_vehicle
 
     check_vehicle(believed)
-    if show_params:
-        lines = parameter_lines(believed)
-        _tell({"commands": lines}, "\n".join(lines), as_json)
-        return
     kinds = [kind.value for kind in Position]
     if position not in kinds:
         raise InputError(f"--position {position}: choose one of {', '.join(kinds)}")
+    if show_params:
+        lines = parameter_lines(believed, Position(position))
+        _tell({"commands": lines}, "\n".join(lines), as_json)
+        return
     effects = choose(list(settings.hidden), believed, settings.seed, settings.hidden_count)
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):

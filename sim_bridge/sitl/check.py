@@ -25,6 +25,13 @@ same, with 1 it warns).
 """
 
 
+VISION_ESTIMATOR = {"EKF2_EV_CTRL": 15, "EKF2_HGT_REF": 3}
+"""What makes EKF2 believe external vision in all that it tells, and in height above the barometer."""
+
+NO_GPS = {"SYS_HAS_GPS": 0}
+"""What lets PX4 arm where no GPS is."""
+
+
 class State(Enum):
     """How far the check is."""
 
@@ -37,11 +44,16 @@ class AllocationCheck:
     """Reads what PX4 has, compares, and sets it where that is asked for (`correct`). Called with PX4's clock.
 
     `notes` collects lines for the user. Where `battery` is given and PX4's own battery simulator is off, PX4 is told
-    the true battery.
+    the true battery. `estimator` is what EKF2 needs for the source of its position.
     """
 
     def __init__(
-        self, vehicle: Vehicle, link: Px4Link, battery: Battery | None = None, correct: bool = False
+        self,
+        vehicle: Vehicle,
+        link: Px4Link,
+        battery: Battery | None = None,
+        correct: bool = False,
+        estimator: dict[str, int] | None = None,
     ) -> None:
         self.vehicle = vehicle
         self.state = State.WAITING
@@ -54,7 +66,9 @@ class AllocationCheck:
         self._battery_us = 0
         self._needed = [*(one.name for one in self._expected), HOVER]
         self._complete_us: int | None = None
-        link.ask([*self._needed, *OWN_BATTERY])
+        self._estimator = estimator or {}
+        self._wished = {**OWN_BATTERY, **self._estimator}
+        link.ask([*self._needed, *self._wished])
 
     def step(self, now_us: int) -> None:
         """Go on with the check, and tell PX4 the battery. Raises `InputError` where PX4 flies another vehicle."""
@@ -64,7 +78,7 @@ class AllocationCheck:
         if self.state is State.WAITING:
             if self._link.has(self._needed):
                 self._complete_us = now_us if self._complete_us is None else self._complete_us
-                if self._link.has(OWN_BATTERY) or now_us - self._complete_us > _OPTIONAL_US:
+                if self._link.has(self._wished) or now_us - self._complete_us > _OPTIONAL_US:
                     self._compare()
             elif now_us - self._begin_us > _PATIENCE_US:
                 self._give_up()
@@ -107,8 +121,8 @@ class AllocationCheck:
             self._set(name, value)
 
     def _beside(self) -> dict[str, float]:
-        """What else differs and is set where that is asked for: hover thrust, and whose battery it is."""
-        wanted = {HOVER: self.vehicle.hover_thrust, **OWN_BATTERY}
+        """What else differs and is set where that is asked for: hover thrust, battery, source of the position."""
+        wanted = {HOVER: self.vehicle.hover_thrust, **self._wished}
         values = self._link.values
         return {name: wish for name, wish in wanted.items() if abs(values.get(name, wish) - wish) > 1e-3}
 
@@ -126,11 +140,17 @@ class AllocationCheck:
             )
         if _SIMULATED in self.changed:
             self.notes.append(f"PX4 flies on a battery of its own until it is started again ({_SIMULATED})")
-        elif not self._feeds_battery:
+        elif not self._feeds_battery and self._battery is not None:
             commands = ", ".join(f"param set {name} {value}" for name, value in OWN_BATTERY.items())
             self.notes.append(
                 f"PX4 flies on a battery of its own; for the vehicle's: {commands}; start PX4 again"
             )
+
+        for name, value in self._estimator.items():
+            if values.get(name, value) != value:
+                self.notes.append(
+                    f"{name} is {values[name]:g} in PX4; to fly by vision: param set {name} {value}"
+                )
 
     def _give_up(self) -> None:
         self.state = State.UNKNOWN

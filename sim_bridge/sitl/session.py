@@ -22,7 +22,14 @@ from models.vehicle import Vehicle
 from sim_bridge.settings import Settings
 from sim_bridge.simulator import Simulator
 from sim_bridge.sitl.allocation import expected_parameters
-from sim_bridge.sitl.check import HOVER, OWN_BATTERY, AllocationCheck, State
+from sim_bridge.sitl.check import (
+    HOVER,
+    NO_GPS,
+    OWN_BATTERY,
+    VISION_ESTIMATOR,
+    AllocationCheck,
+    State,
+)
 from sim_bridge.sitl.lockstep import Ending, Lockstep, Offer, Position, Progress, listen
 from sim_bridge.sitl.px4_link import PAYLOAD_PORT, Px4Link
 from sim_bridge.sitl.sensors import RawNoise, RawSensors
@@ -78,11 +85,19 @@ def parameter_table(vehicle: Vehicle, values: dict[str, int | float] | None = No
     return table
 
 
-def parameter_lines(vehicle: Vehicle) -> list[str]:
+def parameter_lines(vehicle: Vehicle, position: Position) -> list[str]:
     """The commands of PX4's shell (or lines of its `px4-rc.params`) that make its control allocation the vehicle's."""
     lines = [f"param set {one.name} {one.value:.6g}" for one in expected_parameters(vehicle)]
     lines.append(f"param set {HOVER} {vehicle.hover_thrust:.6g}")
-    return lines + [f"param set {name} {value}" for name, value in OWN_BATTERY.items()]
+    wished = {**OWN_BATTERY, **estimator_parameters(position)}
+    return lines + [f"param set {name} {value}" for name, value in wished.items()]
+
+
+def estimator_parameters(position: Position) -> dict[str, int]:
+    """What EKF2 needs to be for a source of position."""
+    if position is Position.GPS:
+        return {}
+    return VISION_ESTIMATOR if position is Position.BOTH else {**VISION_ESTIMATOR, **NO_GPS}
 
 
 class Teller:
@@ -158,7 +173,13 @@ def fly(
         if request.px4_port:
             link = Px4Link(request.px4_port)
             stack.callback(link.close)
-            check = AllocationCheck(vehicle, link, simulator.airframe.battery, request.set_params)
+            check = AllocationCheck(
+                vehicle,
+                link,
+                simulator.airframe.battery,
+                request.set_params,
+                estimator_parameters(request.position),
+            )
         table = stack.enter_context(TruthTable(request.truth, simulator)) if request.truth else None
         answer = seal()
         pace = f"{settings.speed:g} times real time" if settings.speed else "as fast as it goes"
