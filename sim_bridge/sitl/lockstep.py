@@ -24,7 +24,7 @@ from models.errors import InputError
 from sim_bridge.mavlink import wire
 from sim_bridge.mavlink.stream import MessageStream
 from sim_bridge.simulator import Moment, Simulator
-from sim_bridge.sitl.sensors import RawSensors, pressure_altitude
+from sim_bridge.sitl.sensors import FORCE_STEP, RATE_STEP, RawSensors, pressure_altitude, rounded_by_px4
 from sim_bridge.world import PHYSICS_STEP
 
 SENSOR_STEPS = 2
@@ -271,9 +271,11 @@ class Lockstep:
             fields |= _BAROMETER_FIELDS
             hectopascal = sensors.barometer(now)
             altitude = pressure_altitude(hectopascal)
+        force = rounded_by_px4(imu.specific_force, FORCE_STEP)
+        rates = rounded_by_px4(imu.body_rate, RATE_STEP)
         messages = [
             mav.MAVLink_hil_sensor_message(
-                *(time_us, *imu.specific_force, *imu.body_rate, field_x, field_y, field_z),
+                *(time_us, *force, *rates, field_x, field_y, field_z),
                 *(hectopascal, 0.0, altitude, 20.0, fields, 0),
             )
         ]

@@ -57,10 +57,11 @@ class RawNoise:
         return replace(self, **scaled)
 
 
-# Steps of PX4's simulated drivers: 16 g and 2000 deg/s in 16 bits.
+# Steps of PX4's simulated IMU: 16 g and 2000 deg/s in 16 bits.
+FORCE_STEP, RATE_STEP = 9.80665 / 2048, math.radians(2000) / 32768
 _DIGITS = {
-    "accelerometer": 2 * 9.80665 / 2048,
-    "gyroscope": 2 * math.radians(2000) / 32768,
+    "accelerometer": 2 * FORCE_STEP,
+    "gyroscope": 2 * RATE_STEP,
     "magnetometer": 2e-4,
     "pressure": 2e-3,
 }
@@ -121,6 +122,12 @@ def pressure(altitude: float) -> float:
 def pressure_altitude(hectopascal: float) -> float:
     """The altitude, m, at which the standard atmosphere has a pressure (hPa)."""
     return float((1.0 - (hectopascal / _SEA_LEVEL) ** (1.0 / _EXPONENT)) / _LAPSE)
+
+
+def rounded_by_px4(reading: Vector, step: float) -> Vector:
+    """A reading that PX4's simulated IMU, which cuts to whole steps towards zero, will round to them."""
+    x, y, z = (value + math.copysign(0.5 * step, value) for value in reading)
+    return x, y, z
 
 
 class RawSensors:

@@ -17,11 +17,13 @@ from sim_bridge.mavlink import wire
 from sim_bridge.simulator import Moment, Simulator
 from sim_bridge.sitl.sensors import (
     FIELD,
+    FORCE_STEP,
     RawNoise,
     RawSensors,
     magnetic_field,
     pressure,
     pressure_altitude,
+    rounded_by_px4,
     specific_force,
 )
 from sim_bridge.truth.hidden import choose
@@ -148,6 +150,14 @@ def test_without_noise_no_reading_repeats_itself() -> None:
         tuple(int(value / step) for value in sensors.imu(still, still).specific_force) for _ in range(200)
     ]
     assert max(len(list(same)) for _, same in itertools.groupby(counts)) < 10
+
+
+@given(vectors)
+@settings(max_examples=60, deadline=None)
+def test_what_px4_cuts_off_is_rounded(reading) -> None:
+    told = rounded_by_px4(reading, FORCE_STEP)
+    kept = [int(value / FORCE_STEP) * FORCE_STEP for value in told]
+    assert kept == pytest.approx(reading, abs=0.5 * FORCE_STEP + 1e-9)
 
 
 def test_gps_wanders_slowly_around_the_truth() -> None:
