@@ -175,8 +175,13 @@ class Fit:
         )
 
 
+CLOCK = {"transport_delay": 1.0, "motor_lag": 0.5}
+"""Samples by which no log tells a delay and a lag: columns are aligned to one, and a command that is held for a sample
+looks, between samples, like one that is half a sample late and smoothed."""
+
+
 def half_width(free: Free, variance: float, critical: float) -> float:
-    """Half of a 95 % interval. No log tells the clock better than its period, however well a fit is conditioned."""
+    """Half of a 95 % interval, never below the tolerance of the clock, however well a fit is conditioned."""
     return critical * float(np.sqrt(max(variance, 0.0))) + free.tolerance
 
 
@@ -202,7 +207,7 @@ def free_parameters(
         margin = 0.0 if within else 2.0 * abs(p.typical - neutral)
         value = (start or {}).get(p.name, neutral + 0.3 * (typical - neutral))
         low, high = p.low - margin, p.high + margin
-        tolerance = period if effect.name == "transport_delay" else 0.0
+        tolerance = period * CLOCK.get(effect.name, 0.0)
         value = float(np.clip(value, low + 1e-9, high - 1e-9))
         free.append(Free(effect.name, p, value, low, high, neutral, tolerance))
     return free

@@ -339,7 +339,8 @@ def _gains(features: np.ndarray, targets: np.ndarray, fold: np.ndarray) -> np.nd
 
 
 def _ridge(gram: np.ndarray, penalty: float, rows: int) -> np.ndarray:
-    ridge = penalty * np.diag(gram).copy()
+    # a hinge beyond the range that a fold holds is a column of zeros
+    ridge = penalty * np.maximum(np.diag(gram), 1e-6 * rows)
     ridge[0] = 1e-9 * rows  # a constant is free
     return ridge
 
