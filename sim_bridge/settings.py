@@ -1,4 +1,4 @@
-"""Settings of `sim-bridge run` and `fly`: one commented TOML file, overridden by flags."""
+"""Settings of `sim-bridge run`, `sitl` and `fly`: one commented TOML file, overridden by flags."""
 
 from __future__ import annotations
 

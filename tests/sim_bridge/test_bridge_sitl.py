@@ -498,6 +498,26 @@ def test_asked_to_it_sets_the_allocation_and_gives_px4_the_battery(
     assert sum(cell for cell in cells if cell < 65535) * 1e-3 == pytest.approx(16.6, abs=0.5)
 
 
+def test_flying_by_vision_sets_what_the_estimator_needs(sitl, connect, parameters) -> None:
+    running = sitl("--speed", "0", "--set-params", "--position", "vision", link=True)
+    server = parameters(running.link_port, {**IRIS, "EKF2_EV_CTRL": 15, "EKF2_HGT_REF": 1, "SYS_HAS_GPS": 1})
+    serve(connect(running.port), server, 6.0)
+    running.event("checked")
+    assert (server.values["EKF2_HGT_REF"], server.values["SYS_HAS_GPS"]) == (3, 0)
+
+
+def test_an_older_px4_without_the_batterys_parameters_is_checked_all_the_same(
+    sitl, connect, parameters, vehicle
+) -> None:
+    values = {**IRIS, **agreeing(vehicle)}
+    del values["COM_FLTT_LOW_ACT"], values["SIM_BAT_ENABLE"]
+    running = sitl("--speed", "0", link=True)
+    server = parameters(running.link_port, values)
+    serve(connect(running.port), server, 8.0)
+    assert running.event("checked")["changed"] == []
+    assert server.batteries == []  # nobody knows whether it simulates one of its own
+
+
 def test_a_px4_that_does_not_take_parameters_is_refused(sitl, connect, parameters) -> None:
     running = sitl("--speed", "0", "--set-params", link=True)
     serve(connect(running.port), parameters(running.link_port, IRIS, obey=False), 30.0)
