@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 console = Console()
 model_app = typer.Typer(no_args_is_help=True, help="Make, list, show and export model versions.")
 
-FlightArgument = Annotated[Path, typer.Argument(help="A flight: CSV, Parquet, MCAP record or PX4 ULog.")]
+FlightArgument = Annotated[
+    Path, typer.Argument(help="A flight: CSV, Parquet, PX4 ULog, MCAP of the companion or ROS 2.")
+]
 VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
 ]

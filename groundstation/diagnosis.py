@@ -9,7 +9,7 @@ rivals: where the exchange costs nothing, the data cannot tell them apart, and b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -179,9 +179,47 @@ class _Search:
             # what the rotation has found acts on the thrust, too, and is not fitted to it once more
             free = (*self.beside, *added)
             terms = [*self.base.terms, *self.rotation.terms, *(Term(n, start.get(n, {})) for n in free)]
+            terms = self._placed(terms, added)
             fitted = fit(self.problem, terms, refit=free)
+            if through := [n for n in added if self.known[n].with_any]:
+                # what acts through another can balance it far from the best fit: begin once more from "none of it"
+                other = fit(self.problem, self._anew(terms, through), refit=free)
+                fitted = other if self._evidence(other, fitted) > 0.0 else fitted
             self._states[key] = _State(tuple(added), fitted, block_errors(fitted, self.blocks))
         return self._states[key]
+
+    def _anew(self, terms: list[Term], through: Sequence[str]) -> list[Term]:
+        """`terms` with the effects `through` at none of it, and those that they act through at their typical size."""
+        carriers = {n for name in through for n in self.known[name].with_any} - set(self.base.names())
+        values = {n: self.known[n].typical(self.problem.survey) for n in carriers}
+        values |= {n: self._at_rest(self.known[n]) for n in through}
+        return [replace(t, values=values.get(t.effect, t.values)) for t in terms]
+
+    def _placed(self, terms: list[Term], added: Sequence[str]) -> list[Term]:
+        """`terms` with those effects that may end in a wrong optimum begun where they explain most."""
+        for name in added:
+            if (starts := self.known[name].starts_for) is None:
+                continue
+            tried = [
+                [replace(t, values=dict(place)) if t.effect == name else t for t in terms]
+                for place in (
+                    *(t.values for t in terms if t.effect == name and t.values),
+                    *starts(self.problem.survey),
+                )
+            ]
+            terms = min(tried, key=self._start_error)
+        return terms
+
+    def _start_error(self, terms: list[Term]) -> float:
+        """Squared error before any fit; effects without a value yet at none of it."""
+        chain = [
+            (
+                effect_named(t.effect, self.base.effects_directory),
+                t.values or self._at_rest(self.known[t.effect]),
+            )
+            for t in terms
+        ]
+        return float(np.sum((self.problem.measured() - self.problem.predict(chain)) ** 2))
 
     # --- the steps ------------------------------------------------------------------------------------------
 
@@ -195,7 +233,7 @@ class _Search:
         visited = {frozenset(current.added)}
         while len(current.added) < MOST_EFFECTS:
             self.progress(f"{len(current.added)} effects found, looking for the next")
-            following = self._forward(current)
+            following = self._forward(current) or self._exchange(current)
             if following is None:
                 break
             following = self._backward(following)
@@ -204,6 +242,21 @@ class _Search:
             visited.add(frozenset(following.added))
             current = following
         return self._agrees_with_held_out(current)
+
+    def _exchange(self, current: _State) -> _State | None:
+        """The best state with one effect exchanged for another that explains the flight evidently better."""
+        best: _State | None = None
+        for name in current.added:
+            for rival in self._standing_in(current, name):
+                other = self.state((*(n for n in current.added if n != name), rival))
+                if (
+                    self._evident(other, best or current)
+                    and other.cv_total < (best or current).cv_total
+                    and all(self._plausible(other.fit, n) for n in other.added)
+                    and self._shows(other, rival)
+                ):
+                    best = other
+        return best
 
     def _steps(self, current: _State) -> list[tuple[str, ...]]:
         """What may be added at once: one effect, or two where the one acts only through the other."""
@@ -245,8 +298,13 @@ class _Search:
         return state.cv_total * (1.0 + MATERIAL_SHARE) ** len(state.added)
 
     def _screen(self, current: _State, step: tuple[str, ...]) -> float:
-        """Reduction of the squared error by the step, linearised at the current optimum and at its typical
-        size."""
+        """Reduction of the squared error by the step, linearised at the current optimum and at its typical size, at the
+        best of the places where it may act."""
+        starts = self.known[step[-1]].starts_for
+        places = [] if starts is None else starts(self.problem.survey)
+        return max(self._screened(current, step, place) for place in ({}, *places))
+
+    def _screened(self, current: _State, step: tuple[str, ...], place: Mapping[str, float]) -> float:
         values = {t.effect: dict(t.values) for t in current.fit.terms}
         here = -current.fit.residual + 0.0
         chain = [(effect_named(n, self.base.effects_directory), v) for n, v in values.items()]
@@ -254,14 +312,14 @@ class _Search:
         columns = []
         for name in step:
             effect = self.known[name]
-            neutral = dict(values.get(name, self._at_rest(effect)))
+            at = {p.name: place[p.name] for p in effect.parameters if p.structural and p.name in place}
+            neutral = dict(values.get(name, self._at_rest(effect))) | at
             rest = [(e, v) for e, v in chain if e.name != name]
-            typical = effect.typical(self.problem.survey)
             for p in _sizes(effect):
                 moved = {**neutral, p.name: p.typical if p.typical != neutral[p.name] else p.typical * 1.5}
                 prediction = self.problem.predict([*rest, (effect, moved)])
                 columns.append((prediction - base).ravel())
-            chain = [*rest, (effect, typical)]
+            chain = [*rest, (effect, effect.typical(self.problem.survey) | at)]
             base = self.problem.predict(chain) if len(step) > 1 else base
         matrix = np.column_stack([current.fit.jacobian.reshape(self.samples, -1), *columns])
         residual = current.fit.residual.ravel()
@@ -292,14 +350,20 @@ class _Search:
         return np.column_stack([(self.problem.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
 
     def _shows(self, candidate: _State, name: str) -> bool:
-        """Whether the effect at its typical size would be seen beyond the simpler effects it coincides with."""
+        """Whether the flight tells the effect from the simpler ones it may coincide with: at its typical size beyond
+        them, or at its fitted size better than they do in its place."""
         beyond = [n for n in self.known[name].beyond if n in self.candidates or n in self.base.names()]
         if not beyond:
             return True
         mine = self._contribution(candidate, name).sum(axis=1)
         simpler = np.column_stack([self._contribution(candidate, n) for n in beyond])
         rest = mine - simpler @ np.linalg.lstsq(simpler, mine, rcond=None)[0]
-        return self._power(candidate, float(np.sum(rest**2)), len(_sizes(self.known[name]))) > SURE_TO_SEE
+        if self._power(candidate, float(np.sum(rest**2)), len(_sizes(self.known[name]))) > SURE_TO_SEE:
+            return True
+        if any(n in candidate.added or n in self.base.names() for n in beyond):
+            return False
+        others = [n for n in candidate.added if n != name]
+        return self._evident(candidate, self.state((*others, *beyond)))
 
     def _power(self, current: _State, energy: float, count: int) -> float:
         """Probability that `count` parameters are significant when what they change has this squared sum."""
@@ -393,11 +457,22 @@ class _Search:
 
     def _rivals(self, current: _State, name: str) -> tuple[str, ...]:
         """Effects that could stand in for `name` at no cost."""
+        found = []
+        for rival in self._standing_in(current, name):
+            other = self.state((*(n for n in current.added if n != name), rival))
+            if not self._plausible(other.fit, rival):
+                continue
+            equal = self._evidence(current.fit, other.fit) < STRONG_EVIDENCE
+            if equal and self._evident(other, self._without(current, name)):
+                found.append(rival)
+        return tuple(found)
+
+    def _standing_in(self, current: _State, name: str) -> Iterator[str]:
+        """Effects that could take the place of `name` among those found, by their linearisation."""
         rest = [n for n in current.added if n != name]
         present = {*self.base.names(), *rest}
-        found: list[str] = []
         if name in {t.effect for t in self.on_the_way}:
-            return ()  # the rotors themselves show it
+            return  # the rotors themselves show it
         for rival in self.candidates:
             needed = self.known[rival].with_any
             if rival in current.added or (needed and not present & set(needed)):
@@ -406,15 +481,8 @@ class _Search:
                 self.known[n].with_any and not {*present, rival} & set(self.known[n].with_any) for n in rest
             ):
                 continue
-            if self._cannot_stand_in(current, name, rival):
-                continue
-            other = self.state((*rest, rival))
-            if not self._plausible(other.fit, rival):
-                continue
-            equal = self._evidence(current.fit, other.fit) < STRONG_EVIDENCE
-            if equal and self._evident(other, self._without(current, name)):
-                found.append(rival)
-        return tuple(found)
+            if not self._cannot_stand_in(current, name, rival):
+                yield rival
 
     def _cannot_stand_in(self, current: _State, name: str, rival: str) -> bool:
         """Whether the linearised rival takes away so little of what the effect does that no fit need be made."""
@@ -577,7 +645,10 @@ class _Search:
         if not self._excited(current, name, through):
             advice = f"to see it, fly {effect.manoeuvre}"
             return EffectVerdict(name, "not_excited", None, share, p, estimates, (), advice)
-        return EffectVerdict(name, "not_supported", None, share, p, estimates, (), "")
+        size = np.sqrt(max(share, 0.0) * self._before())
+        seen = p < self.significance and share > 0.0
+        advice = f"seen, but too small to matter here: {size:.3f} m/s² RMS" if seen else ""
+        return EffectVerdict(name, "not_supported", None, share, p, estimates, (), advice)
 
     def _beside(self, current: _State, name: str) -> Fit:
         """The effect beside all that is fitted, by one Gauss-Newton step from the present optimum."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import tomllib
+from contextlib import nullcontext
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,11 +19,14 @@ from models.errors import InputError
 if TYPE_CHECKING:
     from groundstation.linear_design import Loop
     from groundstation.tracking import Tracking
+    from groundstation.vehicle_draft import Draft
     from models.flight import Flight
 
 console = Console()
 
-FlightFile = Annotated[Path, typer.Argument(help="A flight: CSV, Parquet, MCAP record or PX4 ULog.")]
+FlightFile = Annotated[
+    Path, typer.Argument(help="A flight: CSV, Parquet, PX4 ULog, MCAP of the companion or ROS 2.")
+]
 VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
 ]
@@ -35,7 +40,7 @@ def register(app: typer.Typer) -> None:
     app.command(
         "import",
         epilog="Example: groundstation import log.csv --mapping mine.mapping.toml --vehicle vehicle.toml "
-        "-o flight.csv",
+        "-o flight.csv; groundstation import log.ulg --draft-vehicle vehicle.toml",
     )(import_command)
     app.command(
         "design", epilog="Example: groundstation design models/vehicles/quad5/vehicle.toml -o design.json"
@@ -120,6 +125,7 @@ SHORT = {
 def _flight_row(file: Path, directory: Path) -> dict[str, Any]:
     """What the table tells of one file; a file that cannot be read tells why."""
     from groundstation.reading import read_flight
+    from groundstation.reading.ros_bag import is_ros_bag
 
     stamp = datetime.fromtimestamp(file.stat().st_mtime, UTC)
     row: dict[str, Any] = {
@@ -132,7 +138,7 @@ def _flight_row(file: Path, directory: Path) -> dict[str, Any]:
     }
     try:
         flight = read_flight(file)
-        if file.suffix.lower() == ".mcap":
+        if file.suffix.lower() == ".mcap" and not is_ros_bag(file):
             row |= _record_facts(file)
     except InputError as error:
         return {**row, "error": str(error)}
@@ -161,39 +167,106 @@ def _record_facts(file: Path) -> dict[str, Any]:
 
 def import_command(
     file: FlightFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Where to: .csv or .parquet.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Where to: .csv or .parquet.")] = None,
     vehicle: VehicleOption = None,
     mapping: MappingOption = None,
+    draft: Annotated[
+        Path | None,
+        typer.Option("--draft-vehicle", help="Draft a vehicle file from a PX4 log; never replaces one."),
+    ] = None,
+    mass: Annotated[float | None, typer.Option(help="kg, for the draft: PX4 does not know it.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Read any flight, check it, and write it in the project's own format with its vehicle file beside it."""
+    """Read any flight, check it, and write it in the project's own format with its vehicle file beside it.
+
+    From a PX4 ULog a vehicle file can be drafted first: `--draft-vehicle vehicle.toml`, with or without `-o`.
+    """
     from groundstation.reading import read_flight
     from groundstation.reading.writing import own_table, write_flight
 
-    if output.resolve() == file.resolve():
+    if output is None and draft is None:
+        raise InputError("import: say where to write the flight with -o FILE.csv, or draft its vehicle file")
+    if output is not None and output.resolve() == file.resolve():
         raise InputError(f"{output}: that is the file itself; choose another -o, the original stays as it is")
-    flight = read_flight(file, vehicle, mapping)
-    vehicle_path = write_flight(flight, output)
+    if mass is not None and draft is None:
+        raise InputError("--mass goes with --draft-vehicle; a vehicle file of your own tells its mass itself")
+    if draft is not None and vehicle is not None:
+        raise InputError("--draft-vehicle: leave out --vehicle, the draft is what the log tells without it")
+    if (
+        output is not None
+        and draft is not None
+        and output.with_suffix(".vehicle.toml").resolve() == draft.resolve()
+    ):
+        raise InputError(f"{draft}: -o writes the vehicle as it was read there; name the draft otherwise")
+    told: dict[str, Any] = {}
+    with nullcontext() if as_json else console.status(f"reading {escape(file.name)}"):
+        drafted = None if draft is None else _drafted(file, draft, mass)
+        flight = None
+        if output is not None:
+            flight = read_flight(file, vehicle if drafted is None else drafted.vehicle, mapping)
+            vehicle_path = write_flight(flight, output)
+            told = {
+                "flight": str(output),
+                "vehicle": str(vehicle_path),
+                "samples": len(flight),
+                "duration": round(flight.duration, 3),
+                "columns": list(own_table(flight)),
+                "notes": list(flight.notes),
+            }
+    if drafted is not None and draft is not None:
+        from groundstation.vehicle_draft import write_draft
+
+        write_draft(drafted, draft)
+        told |= {
+            "vehicle_draft": str(draft),
+            "values": tomllib.loads(drafted.text),
+            "sources": {line.key: line.source for line in drafted.lines},
+            "to_complete": list(drafted.to_complete),
+        }
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    "flight": str(output),
-                    "vehicle": str(vehicle_path),
-                    "samples": len(flight),
-                    "duration": round(flight.duration, 3),
-                    "columns": list(own_table(flight)),
-                    "notes": list(flight.notes),
-                },
-                indent=1,
-            )
-        )
+        typer.echo(json.dumps(told, indent=1))
         return
+    if drafted is not None and draft is not None:
+        _print_draft(drafted, draft, file)
+    if flight is not None:
+        console.print(
+            f"{escape(str(output))}: {len(flight)} samples, {flight.duration:.1f} s at {1 / flight.dt:.0f} Hz"
+        )
+        console.print(f"{escape(str(vehicle_path))}: the vehicle as it was believed to be")
+        _print_notes(flight)
+
+
+def _drafted(file: Path, target: Path, mass: float | None) -> Draft:
+    """The vehicle file drafted from a PX4 log, not yet written."""
+    from groundstation.reading.flight_file import ULOGS
+    from groundstation.reading.px4_log import load_ulog
+    from groundstation.vehicle_draft import draft_vehicle
+
+    if file.suffix.lower() not in ULOGS:
+        raise InputError(f"{file}: only a PX4 ULog holds the parameters that a vehicle file is drafted from")
+    if target.exists():
+        raise InputError(f"{target}: there is a file already; a draft never replaces one, name another")
+    return draft_vehicle(load_ulog(file), mass)
+
+
+def _print_draft(drafted: Draft, target: Path, file: Path) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"{escape(str(target))}: drafted from {escape(file.name)}", title_justify="left")
+    table.add_column("value", overflow="fold")
+    table.add_column("where it is from", overflow="fold")
+    for line in drafted.lines:
+        if line.key == "rotor_directions" and not line.stated:
+            continue
+        mark = "" if line.complete else "[yellow]TO COMPLETE[/yellow] "
+        value = f"{line.key} = {line.value}" if line.stated else f"{line.key} (left out)"
+        table.add_row(escape(value), mark + escape(line.source))
+    console.print(table)
     console.print(
-        f"{escape(str(output))}: {len(flight)} samples, {flight.duration:.1f} s at {1 / flight.dt:.0f} Hz"
+        f"[yellow]the log cannot tell {escape(', '.join(drafted.to_complete))}[/yellow]: correct them in "
+        f"{escape(str(target))}",
+        highlight=False,
     )
-    console.print(f"{escape(str(vehicle_path))}: the vehicle as it was believed to be")
-    _print_notes(flight)
 
 
 def design_command(

@@ -246,12 +246,22 @@ def _used(flight: Flight, bandwidth: float) -> tuple[np.ndarray, dict[str, float
 
 
 def _noise(raw: np.ndarray, used: np.ndarray, sos: np.ndarray, fs: float, differentiate: bool) -> np.ndarray:
-    """RMS (3,) of white sensor noise behind the filter, from third differences of the raw signal, which
-    motion leaves alone; the median makes it deaf to shocks."""
+    """RMS (3,) of sensor noise behind the filter, as if it were white there.
+
+    The smaller of two estimates: from third differences of the raw signal, which motion leaves alone (the median makes
+    it deaf to shocks), and from the spectrum above the pass band, where rotors' vibration at high frequency counts
+    for nothing.
+    """
     third = np.diff(raw, n=3, axis=0)[used[3:]] if used[3:].sum() > 50 else np.diff(raw, n=3, axis=0)
     sigma = np.median(np.abs(third), axis=0) / 0.6745 / np.sqrt(20.0)
     w, h = signal.sosfreqz(sos, worN=512, fs=fs)
     gain = np.abs(h) ** 2  # forward and backward
+    edge = float(w[np.flatnonzero(gain > 0.5)[-1]])
+    count = min(len(raw), round(2.0 * fs))
+    frequency, density = signal.welch(raw, fs=fs, nperseg=count, axis=0)
+    beyond = (frequency > 1.25 * edge) & (frequency < min(2.5 * edge, 0.48 * fs))
+    if beyond.sum() >= 4:
+        sigma = np.minimum(sigma, np.sqrt(density[beyond].mean(axis=0) * 0.5 * fs))
     if differentiate:
         gain = gain * np.sin(2 * np.pi * w / fs) * fs
     return sigma * float(np.sqrt(np.mean(gain**2)))

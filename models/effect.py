@@ -8,7 +8,7 @@ how body rates follow their command; they are seen in the angular acceleration.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
@@ -126,7 +126,7 @@ class Effect:
     names the effects that such a one is taken for where the flight lacks the columns to tell. `one_of` is True where
     at most one of the parameters acts (the one rotor that is damaged): each is then a candidate on its own.
     `typical_for` gives sizes that depend on where the flight went (a ceiling just above its highest point) instead of
-    the parameters' own.
+    the parameters' own; `starts_for` further values to begin a fit from, where one start may end in a wrong optimum.
     """
 
     name: str
@@ -148,6 +148,7 @@ class Effect:
     seen_as: tuple[str, ...] = ()
     one_of: bool = False
     typical_for: Callable[[Motion], Mapping[str, float]] | None = None
+    starts_for: Callable[[Motion], Sequence[Mapping[str, float]]] | None = None
 
     def apply(self, motion: Motion, values: Mapping[str, Any]) -> Motion:
         """The motion with this effect acting; `values` by parameter name."""

@@ -15,7 +15,7 @@ ALLOWED = {
     "companion": {"companion", "mavsdk", "zenoh", "onnxruntime", "mcap", "google"},
     "groundstation": {
         "groundstation", "torch", "control", "scipy", "statsmodels", "rerun", "pyarrow", "pyulog", "onnx",
-        "onnxruntime", "mcap", "google", "zenoh", "jinja2", "markupsafe", "matplotlib", "dask",
+        "onnxruntime", "mcap", "mcap_ros2", "google", "zenoh", "jinja2", "markupsafe", "matplotlib", "dask",
         "distributed",
     },
     "sim_bridge": {"sim_bridge", "companion", "mujoco", "pymavlink", "scipy", "mcap", "google", "onnxruntime"},

@@ -11,7 +11,7 @@ import numpy as np
 from groundstation.reading import plausible
 from groundstation.reading.airborne import flying_mask
 from groundstation.reading.table import Table, own_columns, read_table, unknown_columns
-from groundstation.reading.uniform import even_clock
+from groundstation.reading.uniform import MOST_LOST, even_clock
 from models.errors import InputError
 from models.flight import Flight
 from models.vehicle import Vehicle, load_vehicle
@@ -24,8 +24,8 @@ ULOGS = (".ulg", ".ulog")
 def read_flight(
     path: str | Path, vehicle: str | Path | Vehicle | None = None, mapping: str | Path | None = None
 ) -> Flight:
-    """Read a flight: the project's CSV or Parquet, any table through a column `mapping`, MCAP record or PX4
-    ULog.
+    """Read a flight: the project's CSV or Parquet, any table through a column `mapping`, MCAP record, MCAP of
+    ROS 2, or PX4 ULog.
 
     `vehicle` is a vehicle or its file; without it the one beside the flight is taken (a record of the
     companion carries its own): `NAME.vehicle.toml` with the longest NAME that the flight's name starts with,
@@ -38,6 +38,11 @@ def read_flight(
         raise InputError(f"{path}: no such file; check the path (`groundstation flights DIR` lists flights)")
     if suffix in RECORDS:
         from groundstation.reading.flight_record import read_flight_record
+        from groundstation.reading.px4_flight import flight_of
+        from groundstation.reading.ros_bag import is_ros_bag, load_ros_bag
+
+        if is_ros_bag(path):
+            return flight_of(path, load_ros_bag(path), _vehicle(path, vehicle))
 
         return read_flight_record(path, vehicle)
     if suffix in ULOGS:
@@ -84,33 +89,43 @@ def assemble(
     flying: np.ndarray | None = None,
     commanded: np.ndarray | None = None,
     notes: tuple[str, ...] = (),
+    most_lost: float = MOST_LOST,
 ) -> Flight:
     """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
-    find what was flown. `place(row)` names a row in messages. Raises `InputError` for anything that cannot be
-    analysed."""
+    find what was flown. `place(row)` names a row in messages; `most_lost` is the share of samples that gaps may
+    take. Raises `InputError` for anything that cannot be analysed."""
     origin = str(path)
     _check_groups(origin, columns)
-    plausible.check_clock(t, place)
     said = list(notes)
     names = list(columns)
-    every = {**columns, **{f"extra {k}": v for k, v in (extra or {}).items()}}
+    every = {
+        **plausible.without_empty_attitude(columns),
+        **{f"extra {k}": v for k, v in (extra or {}).items()},
+    }
     if flying is not None:
         every["flying"] = np.asarray(flying, dtype=bool)
     if commanded is not None:
         every["commanded"] = np.asarray(commanded, dtype=bool)
+    t, every, order, more = plausible.in_order(t, every)
+    said += more
+
+    def sorted_place(row: int) -> str:
+        return place(int(order[min(row, len(order) - 1)]) if len(order) else 0)
+
+    plausible.check_clock(t, sorted_place)
     t, every, more = plausible.without_duplicates(t, every)
     said += more
     given = {name: every[name] for name in names}
     others = {name: column for name, column in every.items() if name not in given}
     index = np.arange(len(t))
-    _, given_and_index, more = plausible.complete(t, {**given, "row": index}, place)
+    _, given_and_index, more = plausible.complete(t, {**given, "row": index}, sorted_place)
     kept = given_and_index.pop("row")
     t, given = t[kept], given_and_index
     others = {name: column[kept] for name, column in others.items()}
     said += more
     plausible.check_units(given, vehicle, origin)
     given = plausible.continuous(given)
-    t, every, more = even_clock(t, {**given, **others}, origin)
+    t, every, more = even_clock(t, {**given, **others}, origin, most_lost)
     said += more
     given = {name: every[name] for name in given}
     if "thrust_command" not in given:
@@ -174,9 +189,14 @@ def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:
         return load_vehicle(vehicle)
     if (beside := _beside(path, "vehicle.toml")) is not None:
         return load_vehicle(beside)
+    draft = (
+        f"; `groundstation import {path} --draft-vehicle {path.with_name('vehicle.toml')}` drafts one"
+        if path.suffix.lower() in ULOGS
+        else ""
+    )
     raise InputError(
         f"{path}: no vehicle.toml beside it; pass --vehicle FILE (mass, hover_thrust and rotors as you "
-        "believe them)"
+        f"believe them){draft}"
     )
 
 

@@ -3,34 +3,63 @@
 from __future__ import annotations
 
 import difflib
+import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from groundstation.reading.csv_text import read_csv_text
 from models.errors import InputError
 from models.flight import COLUMNS
 
 OWN_NAMES = tuple(name for names, _, _ in COLUMNS.values() for name in names)
 """Names of all columns of the project's own CSV, besides `t` and `flying`."""
+NOTHING = [
+    "",
+    "nan",
+    "NaN",
+    "NAN",
+    "-nan",
+    "null",
+    "NULL",
+    "none",
+    "None",
+    "NA",
+    "N/A",
+    "n/a",
+    "#N/A",
+    "-",
+    "--",
+]
+"""What stands for a missing value."""
+MOST_RAGGED = 0.02
+"""Share of lines with too few or too many values above which a file is no table."""
 
 
 @dataclass(frozen=True)
 class Table:
     """Columns (N,) of floats by name; missing values are nan. `origin` names the file in messages; row i of a
-    CSV is line i + 2 of the file (`first_line`), a Parquet row has no line."""
+    CSV is line i + `first_line` of the file, but for the lines that were `left_out`; a Parquet row has no line."""
 
     origin: str
     columns: dict[str, np.ndarray]
     notes: tuple[str, ...] = ()
     first_line: int | None = 2
+    left_out: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
 
     def place(self, row: int) -> str:
         """Where a row stands, for a message."""
-        return f"{self.origin}, " + (f"line {row + self.first_line}" if self.first_line else f"row {row + 1}")
+        if not self.first_line:
+            return f"{self.origin}, row {row + 1}"
+        line = row + self.first_line
+        for left_out in sorted(self.left_out):
+            line += left_out <= line
+        return f"{self.origin}, line {line}"
 
     def column(self, name: str, wanted_by: str = "") -> np.ndarray:
         """A column by name; raises `InputError` with the nearest names where it is missing."""
@@ -92,39 +121,45 @@ def unknown_columns(table: Table) -> dict[str, np.ndarray]:
 
 
 def _read_csv(path: Path) -> Table:
-    from pyarrow import ArrowInvalid
+    from pyarrow import ArrowException
     from pyarrow import csv as arrow_csv
 
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the flight ({error.strerror}); check the path") from None
-    if not text.strip():
-        raise InputError(f"{path}: the file is empty; log the flight again or pass another file")
-    header = text[: text.find(b"\n")] if b"\n" in text else text
-    delimiter = ";" if header.count(b";") > header.count(b",") else ("\t" if b"\t" in header else ",")
-    notes: list[str] = []
-    body = text
-    if not text.endswith(b"\n"):
-        last = text[text.rfind(b"\n") + 1 :]
-        if last.count(delimiter.encode()) < header.count(delimiter.encode()):
-            body = text[: text.rfind(b"\n") + 1]
-            notes.append("the last line is cut short and was left out")
-    try:
-        import io
+    text = read_csv_text(path)
+    ragged: list[int] = []
 
+    def without(row: Any) -> str:
+        ragged.append(row.number - 2 + text.first_line if row.number is not None else 0)
+        return "skip"
+
+    try:
         arrow = arrow_csv.read_csv(
-            io.BytesIO(body),
-            parse_options=arrow_csv.ParseOptions(delimiter=delimiter),
+            io.BytesIO(text.content),
+            read_options=arrow_csv.ReadOptions(use_threads=False),  # rows are only numbered in one thread
+            parse_options=arrow_csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=without),
             convert_options=arrow_csv.ConvertOptions(
-                null_values=["", "nan", "NaN", "NAN", "null", "-nan"], strings_can_be_null=True
+                null_values=NOTHING, strings_can_be_null=True, decimal_point=text.decimal
             ),
         )
-    except (ArrowInvalid, UnicodeDecodeError) as error:
+    except (ArrowException, UnicodeDecodeError) as error:
         raise InputError(
             f"{path}: not a table of comma-separated values: {error}; correct that line"
         ) from None
-    return Table(str(path), _numbers(str(path), arrow, 2), tuple(notes))
+    notes = list(text.notes)
+    if ragged:
+        if len(ragged) > MOST_RAGGED * len(arrow):
+            raise InputError(
+                f"{path}, line {ragged[0]}: {len(ragged)} of {len(arrow) + len(ragged)} lines have another number of "
+                f"values than the header has names ({arrow.num_columns}); correct that line"
+            )
+        lines = "line" if len(ragged) == 1 else "lines"
+        notes.append(f"{len(ragged)} {lines} without all values left out, the first is line {ragged[0]}")
+    names = [name.strip().lstrip("#").strip() for name in arrow.column_names]
+    for name in names:
+        if name and names.count(name) > 1:
+            raise InputError(f"{path}: two columns are named '{name}'; rename or remove one")
+    return Table(
+        str(path), _numbers(str(path), arrow, text.first_line), tuple(notes), text.first_line, tuple(ragged)
+    )
 
 
 def _read_parquet(path: Path) -> Table:
@@ -148,6 +183,9 @@ def _numbers(origin: str, arrow: object, first_line: int | None) -> dict[str, np
     for name, column in zip(arrow.column_names, arrow.columns, strict=True):  # type: ignore[attr-defined]
         if pa.types.is_null(column.type):
             continue
+        if pa.types.is_temporal(column.type) and not pa.types.is_duration(column.type):
+            columns[name.strip().lstrip("#").strip()] = _seconds(column)
+            continue
         if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
             _reject_text(origin, name, column.to_pylist(), first_line)
         if not (
@@ -166,6 +204,19 @@ def _numbers(origin: str, arrow: object, first_line: int | None) -> dict[str, np
             f"{origin}: no rows of numbers in it; a header line and one row for each sample are needed"
         )
     return columns
+
+
+def _seconds(column: Any) -> np.ndarray:
+    """Dates and times of day as seconds (N,) from the first on."""
+    import pyarrow as pa
+
+    if pa.types.is_time(column.type):
+        ticks = column.cast(pa.time64("ns")).cast(pa.int64())
+    else:
+        ticks = column.cast(pa.timestamp("ns")).cast(pa.int64())
+    first = ticks.drop_null()[0].as_py() if ticks.null_count < len(ticks) else 0
+    since = np.array(ticks.fill_null(first).to_numpy(), dtype=np.int64) - first
+    return np.where(np.array(ticks.is_valid()), 1e-9 * since, np.nan)
 
 
 def _reject_text(origin: str, name: str, values: list[str | None], first_line: int | None) -> None:

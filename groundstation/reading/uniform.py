@@ -34,20 +34,20 @@ def segments(t: np.ndarray) -> tuple[slice, ...]:
 
 
 def even_clock(
-    t: np.ndarray, columns: dict[str, np.ndarray], origin: str
+    t: np.ndarray, columns: dict[str, np.ndarray], origin: str, most_lost: float = MOST_LOST
 ) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
     """Put columns (N, ...) of a strictly increasing clock `t` (N,) on even sampling within each segment.
 
     Quaternions (a column of that name) keep their sign continuous and their norm 1. Returns the new clock,
-    the new columns and notes on what was done. Raises `InputError` where more than a quarter of the samples
-    is lost.
+    the new columns and notes on what was done. Raises `InputError` where more than the share
+    `most_lost` of the samples is lost.
     """
     notes: list[str] = []
     steps = np.diff(t)
     dt = float(np.median(steps))
     parts = segments(t)
     lost = float(np.sum(np.maximum(steps / dt - 1.0, 0.0)) * dt / (t[-1] - t[0]))
-    if lost > MOST_LOST:
+    if lost > most_lost:
         worst = int(np.argmax(steps))
         raise InputError(
             f"{origin}: {100 * lost:.0f} % of the samples are lost, most in {steps[worst]:.2f} s after "

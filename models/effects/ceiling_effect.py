@@ -30,12 +30,22 @@ def formula(motion: Motion, *, rho: Array, ceiling: Array) -> Motion:
     return motion.with_(thrust=motion.thrust * (total / float(len(arms))))
 
 
-def just_above(motion: Motion) -> Mapping[str, float]:
-    """A ceiling one rotor radius above the highest point that the rotors reached for a moment."""
+def _at(motion: Motion, radii: float) -> Mapping[str, float]:
+    """A ceiling so many rotor radii above the highest point that the rotors reached for a moment."""
     reached = float(np.quantile(np.asarray(motion.height), 0.998))
     hubs = max((z for _, _, z in motion.vehicle.rotor_positions), default=0.0)
     above = reached + hubs + motion.vehicle.rotor_height
-    return {"ceiling": float(np.clip(above + motion.vehicle.rotor_radius, LOWEST, HIGHEST))}
+    return {"ceiling": float(np.clip(above + radii * motion.vehicle.rotor_radius, LOWEST, HIGHEST))}
+
+
+def just_above(motion: Motion) -> Mapping[str, float]:
+    """A ceiling one rotor radius above the highest point."""
+    return _at(motion, 1.0)
+
+
+def heights(motion: Motion) -> list[Mapping[str, float]]:
+    """Ceilings from the highest point, as a wrong height may tell it, to four radii above."""
+    return [{"rho": 2.0, **_at(motion, radii)} for radii in (0.0, 0.5, 2.0, 4.0)]
 
 
 LOWEST, HIGHEST = 0.3, 30.0
@@ -59,4 +69,5 @@ EFFECT = Effect(
     confounded_with=("thrust_gain", "ground_effect", "axial_inflow"),
     beyond=("thrust_gain",),
     typical_for=just_above,
+    starts_for=heights,
 )

@@ -91,8 +91,8 @@ BAD = {
     "too slow": (lambda c: {n: v[::20] for n, v in c.items()}, ["sampled at 5 Hz", "100 Hz is good"]),
     "a time that is no number": (at("t", 77, np.nan), ["line 79", "time is not a number", "remove that row"]),
     "values missing": (
-        at("velocity_x", slice(100, 300), np.nan),
-        ["line 102", "velocity", "17 % of the rows", "log all"],
+        at("velocity_x", slice(100, 500), np.nan),
+        ["line 102", "velocity", "33 % of the rows", "log all"],
     ),
     "half the samples lost": (
         lambda c: {n: np.delete(v, np.s_[200:800]) for n, v in c.items()},
@@ -157,6 +157,7 @@ CONTENTS = {
     "empty": (b"", ["is empty"]),
     "header only": (b"t,thrust_command\n", ["no rows"]),
     "words": (b"t,thrust_command\n0.01,0.4\n0.02,full\n0.03,0.4\n", ["line 3", "'full'", "not a number"]),
+    "two columns of a name": (b"t,x,x\n0.01,1,2\n0.02,1,2\n", ["two columns are named 'x'", "rename"]),
     "ragged": (b"t,thrust_command\n0.01,0.4\n0.02,0.4,9\n0.03,0.4\n", ["correct that line"]),
     "binary": (bytes(range(256)) * 40, ["bad.csv"]),
 }

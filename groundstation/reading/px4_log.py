@@ -1,0 +1,271 @@
+"""What a PX4 vehicle logged: topics by instance, parameters, drop-outs; loaded from a ULog.
+
+Topics and fields: the message definitions of PX4 1.11 to today. A topic that changed its name or its fields keeps
+what it was called when it was logged; `px4_flight` knows the names.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from models.errors import InputError
+
+TOPICS = (
+    "actuator_armed",
+    "actuator_controls_0",
+    "actuator_motors",
+    "actuator_outputs",
+    "battery_status",
+    "esc_status",
+    "estimator_attitude",
+    "estimator_local_position",
+    "estimator_selector_status",
+    "hover_thrust_estimate",
+    "sensor_combined",
+    "trajectory_setpoint",
+    "vehicle_acceleration",
+    "vehicle_angular_velocity",
+    "vehicle_attitude",
+    "vehicle_attitude_setpoint",
+    "vehicle_land_detected",
+    "vehicle_local_position",
+    "vehicle_local_position_setpoint",
+    "vehicle_odometry",
+    "vehicle_rates_setpoint",
+    "vehicle_status",
+    "vehicle_thrust_setpoint",
+)
+DAY = 86_400_000_000  # us
+SANE = {
+    "vehicle_thrust_setpoint": 2.0,
+    "vehicle_rates_setpoint": 200.0,
+    "vehicle_attitude_setpoint": 200.0,
+    "actuator_controls_0": 2.0,
+    "actuator_motors": 2.0,
+    "vehicle_angular_velocity": 200.0,
+    "sensor_combined": 2000.0,
+    "vehicle_acceleration": 2000.0,
+}
+"""Magnitudes that no sample of a topic reaches (normalised, rad/s, m/s²): more is damage, not flight."""
+MEASURED = ("xyz", "control", "thrust_body", "roll", "pitch", "yaw", "gyro_rad", "accelerometer_m_s2")
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One instance of a topic: `t` (M,) in s of the log's clock, strictly increasing, and its fields (M,) by
+    name."""
+
+    name: str
+    t: np.ndarray
+    fields: dict[str, np.ndarray]
+    instance: int = 0
+
+    @property
+    def rate(self) -> float:
+        """Usual rate, Hz: pauses do not lower it."""
+        return 1.0 / float(np.median(np.diff(self.t)))
+
+    def rate_within(self, first: float, last: float) -> float:
+        """Samples per second between two times, Hz."""
+        inside = np.searchsorted(self.t, [first, last])
+        return float(inside[1] - inside[0]) / max(last - first, 1e-9)
+
+    def stack(self, *names: str) -> np.ndarray:
+        """Fields as columns (M, k)."""
+        with np.errstate(invalid="ignore"):  # a damaged file holds what is no number
+            return np.stack([np.asarray(self.fields[name], dtype=float) for name in names], -1)
+
+    def has(self, *names: str) -> bool:
+        """Whether the topic has all of these fields."""
+        return all(name in self.fields for name in names)
+
+    def first_of(self, *choices: tuple[str, ...]) -> np.ndarray | None:
+        """The first group of fields that the topic has, as columns (M, k)."""
+        return next((self.stack(*names) for names in choices if self.has(*names)), None)
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log: the instances of each topic by name, parameters at its start, their later changes (time in s, name,
+    value), and what the file itself had to tell. `advice` says how to record what is missing, `faster` how to record
+    more of it."""
+
+    origin: str
+    topics: dict[str, tuple[Topic, ...]]
+    parameters: dict[str, float] = field(default_factory=dict)
+    changes: tuple[tuple[float, str, float], ...] = ()
+    version: str = ""
+    hardware: str = ""
+    notes: tuple[str, ...] = ()
+    advice: str = "log with PX4's default profile (SDLOG_PROFILE 1)"
+    faster: str = "SDLOG_PROFILE 3 logs manoeuvres faster"
+
+    def topic(self, name: str, *needed: str) -> Topic | None:
+        """The first instance of a topic that has the needed fields."""
+        return next((t for t in self.topics.get(name, ()) if t.has(*needed)), None)
+
+    def parameter(self, *names: str) -> float | None:
+        """The value of the first of these parameters that the log holds."""
+        return next((self.parameters[name] for name in names if name in self.parameters), None)
+
+    def parameters_at(self, t: float) -> dict[str, float]:
+        """The parameters as they were at a time (s)."""
+        return self.parameters | {name: value for when, name, value in self.changes if when <= t}
+
+
+def load_ulog(path: Path) -> Log:
+    """Read a ULog, also one that is cut short or damaged. Raises `InputError` for a file that is no ULog."""
+    from pyulog import ULog
+
+    try:
+        # pyulog prints what it meets in a damaged file; we tell it ourselves.
+        with contextlib.redirect_stdout(io.StringIO()):
+            log = ULog(_Stream(io.FileIO(path)), message_name_filter_list=list(TOPICS))
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the log ({error.strerror or error}); check the path") from None
+    except Exception as error:  # noqa: BLE001 - pyulog lets through whatever its parser meets
+        raise InputError(
+            f"{path}: not a whole ULog ({error}); copy it from the vehicle's card again"
+        ) from None
+    notes = []
+    if log.dropouts:
+        lost = sum(d.duration for d in log.dropouts) / 1000
+        notes.append(f"the logger dropped data {_times(len(log.dropouts))}, {lost:.1f} s in all")
+    if log.file_corruption:
+        notes.append("parts of the log are damaged and were skipped")
+    release = log.get_version_info()
+    topics, said = _selected(collect((d.name, int(d.multi_id), dict(d.data)) for d in log.data_list))
+    notes += said
+    return Log(
+        str(path),
+        topics,
+        {name: float(value) for name, value in log.initial_parameters.items() if _is_number(value)},
+        tuple(
+            (1e-6 * t, name, float(value)) for t, name, value in log.changed_parameters if _is_number(value)
+        ),
+        _version(release),
+        str(log.msg_info_dict.get("ver_hw", "")),
+        tuple(notes),
+    )
+
+
+class _Stream(io.BufferedReader):
+    """A file in which a step back after a read that met the end is as long as what was read.
+
+    pyulog (1.3) steps back by what it asked for. In a damaged file that is cut as well it then never ends.
+    """
+
+    missing = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Bytes from here on; how many of those asked for were missing is remembered."""
+        data = super().read(size)
+        self.missing = max(0, (size or 0) - len(data))
+        return data
+
+    def seek(self, target: int, whence: int = 0, /) -> int:
+        """Go to a position; backwards from here no further than was read."""
+        if whence == io.SEEK_CUR and target < 0:
+            target, self.missing = min(0, target + self.missing), 0
+        return super().seek(target, whence)
+
+
+def collect(parts: Iterable[tuple[str, int, dict[str, Any]]]) -> dict[str, tuple[Topic, ...]]:
+    """Topics by name, instances in order, of parts (name, instance, fields with `timestamp` in us).
+
+    A topic that was subscribed twice comes in two parts; they are one. Samples whose times cannot be true (a damaged
+    file) are left out.
+    """
+    joined: dict[tuple[str, int], list[dict[str, np.ndarray]]] = {}
+    for name, instance, fields in parts:
+        joined.setdefault((name, instance), []).append(fields)
+    topics: dict[str, list[Topic]] = {}
+    for (name, instance), pieces in sorted(joined.items(), key=lambda item: item[0]):
+        shared = set.intersection(*(set(piece) for piece in pieces))
+        fields = {
+            key: np.concatenate([np.asarray(p[key]) for p in pieces]) for key in pieces[0] if key in shared
+        }
+        if len(pieces) > 1:
+            order = np.argsort(fields["timestamp"], kind="stable")
+            fields = {key: values[order] for key, values in fields.items()}
+        topic = _topic(name, instance, fields)
+        if topic is not None:
+            topics.setdefault(name, []).append(topic)
+    return {name: tuple(instances) for name, instances in topics.items()}
+
+
+def _selected(topics: dict[str, tuple[Topic, ...]]) -> tuple[dict[str, tuple[Topic, ...]], list[str]]:
+    """Of several estimators the one that PX4 flew by, where its own choice (`vehicle_*`) was not logged."""
+    notes: list[str] = []
+    selector = topics.get("estimator_selector_status", ())
+    primary = 0
+    if selector and selector[0].has("primary_instance"):
+        primary = int(np.median(selector[0].fields["primary_instance"]))
+    for wanted, estimated in (
+        ("vehicle_attitude", "estimator_attitude"),
+        ("vehicle_local_position", "estimator_local_position"),
+    ):
+        instances = topics.get(estimated, ())
+        if wanted in topics or not instances:
+            continue
+        chosen = next((topic for topic in instances if topic.instance == primary), instances[0])
+        topics = {**topics, wanted: (Topic(wanted, chosen.t, chosen.fields),)}
+        notes.append(f"{wanted} is that of {estimated} {chosen.instance}, the estimator in use")
+    return topics, notes
+
+
+def _topic(name: str, instance: int, fields: dict[str, np.ndarray]) -> Topic | None:
+    stamp = np.asarray(fields["timestamp"], dtype=np.int64)
+    sample = np.asarray(fields.get("timestamp_sample", np.zeros_like(stamp)), dtype=np.int64)
+    # The time of measurement, where it is known and sane; the time of publication otherwise.
+    if np.all(sample > 0) and np.max(np.abs(stamp - sample), initial=0) < 1_000_000:
+        stamp = sample
+    rows = _in_order(stamp)
+    if name in SANE:
+        with np.errstate(invalid="ignore"):
+            wild = [
+                np.abs(v[rows]) > SANE[name] for key, v in fields.items() if key.split("[")[0] in MEASURED
+            ]
+        rows = rows[~np.any(wild, axis=0)] if wild else rows
+    if len(rows) < 2:
+        return None
+    return Topic(name, stamp[rows] * 1e-6, {key: values[rows] for key, values in fields.items()}, instance)
+
+
+def _in_order(stamp: np.ndarray) -> np.ndarray:
+    """Rows of strictly increasing times. Of times that contradict each other the fewer are wrong: one time far in
+    the future must not cost all that follow, nor one in the past all that went before."""
+    if not len(stamp):
+        return np.array([], dtype=int)
+    rows = np.flatnonzero(np.abs(stamp - np.median(stamp)) < DAY)
+    times = stamp[rows]
+    below_all_later = times <= np.minimum.accumulate(times[::-1])[::-1]
+    above_all_earlier = times >= np.maximum.accumulate(times)
+    rows = rows[below_all_later if below_all_later.sum() >= above_all_earlier.sum() else above_all_earlier]
+    return rows[np.concatenate([[True], np.diff(stamp[rows]) > 0])] if len(rows) else rows
+
+
+def _version(release: tuple[int, int, int, int] | None) -> str:
+    """As in "1.15.0" or "1.16.0 alpha"; empty where the log does not tell."""
+    if release is None:
+        return ""
+    major, minor, patch, kind = release
+    word = {0: "dev", 64: "alpha", 128: "beta", 192: "rc"}.get(kind & 0xC0 if kind < 255 else 255, "")
+    return f"{major}.{minor}.{patch}{' ' + word if word else ''}"
+
+
+def _is_number(value: object) -> bool:
+    """Whether the value of a parameter can be used; in a damaged file it can be anything."""
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"

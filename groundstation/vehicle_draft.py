@@ -1,0 +1,346 @@
+"""A vehicle file drafted from the log of a PX4 vehicle: what its parameters and its flight tell, and what they do not.
+
+PX4 needs neither mass nor propeller, so it knows neither; geometry it needs only up to its scale. A draft says of each
+value where it is from, and marks what its owner has to weigh, measure or check.
+"""
+
+from __future__ import annotations
+
+import os
+import textwrap
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from groundstation.reading.px4_flight import (
+    ACCELEROMETER,
+    FAST,
+    RATE,
+    Airborne,
+    airborne,
+    battery_in_use,
+    check_multirotor,
+    ground_level,
+    motor_count,
+    period_mean,
+)
+from groundstation.reading.px4_log import Log
+from groundstation.reading.px4_thrust import commanded_thrust
+from models.errors import InputError
+from models.vehicle import GRAVITY, Vehicle, vehicle_from_table
+
+STAND_IN_MASS = 1.0  # kg
+CELL = 3.7  # V, a lithium cell in the middle of its discharge
+SLOW = 1.0  # m/s; below it drag is small beside the thrust
+CLEAR = 0.5  # m above the ground
+SETTLED = 3.0  # s of slow flight from which a hover thrust is measured
+PROPELLER = 0.45
+"""Radius of a propeller in distances of neighbouring rotors, usual for a quadrotor whose propellers nearly touch."""
+GAINS = ("MC_ROLLRATE_P", "MC_ROLLRATE_I", "MC_ROLLRATE_D", "MC_ROLLRATE_K", "MC_ROLLRATE_MAX",
+         "MC_YAWRATE_P", "MC_YAWRATE_MAX")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Line:
+    """One value of a draft: key and TOML value, unit, where it is from; `complete` is False for what its owner has to
+    measure, and `stated` False for a line that is only suggested, in a comment."""
+
+    key: str
+    value: str
+    unit: str
+    source: str
+    complete: bool = True
+    stated: bool = True
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A drafted vehicle file: its lines, its text, and the vehicle it loads as."""
+
+    lines: tuple[Line, ...]
+    text: str
+    vehicle: Vehicle
+
+    @property
+    def to_complete(self) -> tuple[str, ...]:
+        """Keys that the log cannot tell."""
+        return tuple(line.key for line in self.lines if not line.complete)
+
+
+def draft_vehicle(log: Log, mass: float | None = None) -> Draft:
+    """The vehicle of a PX4 log, as far as the log tells; `mass` in kg as its owner weighed it. Raises `InputError` for
+    the log of anything but a multirotor."""
+    check_multirotor(log)
+    try:
+        air, _ = airborne(log)
+    except InputError:
+        air = None
+    simulated = bool(log.parameter("SIH_MASS")) and (
+        log.parameter("SYS_HITL") == 2 or "SITL" in log.hardware or not log.hardware
+    )
+    lines = (
+        _name(log),
+        _mass(log, mass, simulated),
+        *_inertia(log, simulated),
+        *_rotors(log, simulated),
+        *_thrust(log, air),
+        *_dynamics(log, simulated),
+    )
+    text = _text(log, lines)
+    return Draft(lines, text, vehicle_from_table(tomllib.loads(text), "draft"))
+
+
+def write_draft(draft: Draft, path: Path) -> None:
+    """Write a draft to a new file, whole or not at all. Raises `InputError` where there is one already."""
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(draft.text, encoding="utf-8")
+        os.link(partial, path)  # unlike a rename it never replaces a file
+    except FileExistsError:
+        raise InputError(
+            f"{path}: there is a vehicle file already; a draft never replaces one, name another"
+        ) from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot write the draft ({error.strerror}); choose another place") from None
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _name(log: Log) -> Line:
+    airframe = log.parameter("SYS_AUTOSTART")
+    name = f"px4-{airframe:.0f}" if airframe else "px4"
+    source = f"SYS_AUTOSTART {airframe:.0f}" if airframe else "the log names no airframe"
+    return Line("name", f'"{name}"', "", f"{source}; give it your own name (it is part of Zenoh keys)")
+
+
+def _mass(log: Log, mass: float | None, simulated: bool) -> Line:
+    if mass is not None:
+        return Line("mass", _number(mass), "kg", "as given with --mass")
+    if simulated:
+        return Line("mass", _number(log.parameters["SIH_MASS"]), "kg", "SIH_MASS, the simulated vehicle's")
+    return Line(
+        "mass", _number(STAND_IN_MASS), "kg",
+        "NOT KNOWN TO PX4, a stand-in: WEIGH the vehicle with its battery. Accelerations do not depend on it, all "
+        "forces in newtons do", complete=False,
+    )  # fmt: skip
+
+
+def _inertia(log: Log, simulated: bool) -> tuple[Line, ...]:
+    names = ("SIH_IXX", "SIH_IYY", "SIH_IZZ")
+    if simulated and all(name in log.parameters for name in names):
+        moments = ", ".join(_number(log.parameters[name]) for name in names)
+        return (Line("inertia", f"[{moments}]", "kg m^2, diagonal", "SIH_IXX, SIH_IYY, SIH_IZZ"),)
+    return (
+        Line(
+            "inertia",
+            "[0.0, 0.0, 0.0]",
+            "kg m^2",
+            "not known to PX4; only effects of torques need it",
+            False,
+            False,
+        ),
+    )
+
+
+def _rotors(log: Log, simulated: bool) -> tuple[Line, ...]:
+    count = motor_count(log)
+    keys = [f"CA_ROTOR{i}_{axis}" for i in range(count) for axis in ("PX", "PY", "PZ", "KM")]
+    found = [log.parameter(key) for key in keys]
+    radius = Line("rotor_radius", "0.1", "m", "not known to PX4: MEASURE, half a propeller's diameter", False)
+    if count != 4 or any(value is None for value in found):
+        airframe = log.parameter("SYS_AUTOSTART")
+        why = (
+            f"the vehicle has {count} motors, the file describes four: leave it out"
+            if count != 4
+            else "not in the log: before 1.13 a mixer file stands for it "
+            f"(SYS_AUTOSTART {airframe or 0:.0f}, MAV_TYPE {log.parameter('MAV_TYPE') or 0:.0f}): MEASURE. Shown is "
+            "the order of PX4's quad-x: front right, rear left, front left, rear right"
+        )
+        shown = "[[0.1, -0.1, 0.0], [-0.1, 0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, -0.1, 0.0]]"
+        return (
+            radius,
+            Line("rotor_positions", shown, "m, FLU", why, False, False),
+            Line("rotor_directions", "[1, 1, -1, -1]", "1: counter-clockwise from above", why, False, False),
+        )
+    values = np.array(found, dtype=float).reshape(4, 4)
+    positions = values[:, :3] * [1.0, -1.0, -1.0] + 0.0
+    directions = np.where(values[:, 3] >= 0, 1, -1)
+    relative = bool(np.allclose(np.abs(positions[:, :2]), np.abs(positions[0, 0]), atol=1e-6)) and (
+        abs(positions[0, 0]) >= 0.5
+    )
+    gaps = [np.linalg.norm(a - b) for i, a in enumerate(positions) for b in positions[:i]]
+    arms = [log.parameter("SIH_L_PITCH"), log.parameter("SIH_L_ROLL")]
+    if relative and simulated and None not in arms:
+        return (
+            radius,
+            Line("rotor_positions", _rows(np.sign(positions) * [*arms, 0.0]), "m, FLU",
+                 "SIH_L_PITCH, SIH_L_ROLL in the order of CA_ROTOR*"),
+            Line("rotor_directions", str(directions.tolist()), "", "the signs of CA_ROTOR0..3_KM"),
+        )  # fmt: skip
+    if relative:
+        where = Line(
+            "rotor_positions", _rows(positions), "m, FLU",
+            "CA_ROTOR*_PX, _PY, _PZ hold equal arms of a metre, which PX4 takes for proportions only: MEASURE",
+            False, False,
+        )  # fmt: skip
+        turning = Line(
+            "rotor_directions", str(directions.tolist()), "", "the signs of CA_ROTOR*_KM", True, False
+        )
+        return radius, where, turning
+    radius = Line(
+        "rotor_radius", _number(float(f"{PROPELLER * min(gaps):.2g}")), "m",
+        f"not known to PX4: MEASURE, half a propeller's diameter ({min(gaps) / 2:.2g} m would touch the neighbour)",
+        False,
+    )  # fmt: skip
+    return (
+        radius,
+        Line("rotor_positions", _rows(positions), "m, FLU",
+             "CA_ROTOR0..3 _PX, _PY, _PZ (y and z turned from FRD); CHECK, PX4 flies as well with another scale"),
+        Line("rotor_directions", str(directions.tolist()), "", "the signs of CA_ROTOR0..3_KM"),
+    )  # fmt: skip
+
+
+def _thrust(log: Log, air: Airborne | None) -> tuple[Line, ...]:
+    believed = log.parameter("MPC_THR_HOVER")
+    said = f"MPC_THR_HOVER is {believed:g}" if believed is not None else "the log holds no MPC_THR_HOVER"
+    factor = log.parameter("THR_MDL_FAC")
+    cells = next((n for p in ("BAT1_N_CELLS", "BAT_N_CELLS") if (n := log.parameter(p) or 0) > 0), 0)
+    hover, how = _hover(log, air)
+    estimate = _estimate(log, air)
+    if hover is not None:
+        also = "" if estimate is None else f"; hover_thrust_estimate {estimate:.3f}"
+        source = f"{how}; {said}{also}. A flight cannot show that its own hover thrust is wrong"
+    elif estimate is not None:
+        hover, source = estimate, f"hover_thrust_estimate, median in the air; {said}"
+    elif believed is not None:
+        hover, source = believed, "MPC_THR_HOVER: what PX4 was told, not what was flown"
+    else:
+        hover, source = 0.5, f"{said}, nor a flight: a stand-in, FLY A HOVER"
+    curve = Line(
+        "thrust_model", '"linear"', "",
+        "what PX4 assumes of this command"
+        + (f", with THR_MDL_FAC {factor:g}" if factor else
+           f"; {'the log holds no THR_MDL_FAC' if factor is None else 'THR_MDL_FAC is 0'}, real propellers are nearer "
+           'to "quadratic": the effect thrust_curve tells'),
+    )  # fmt: skip
+    voltage = None
+    if air is not None and (battery := battery_in_use(log, air)) is not None:
+        flown = (battery.t >= air.span[0]) & (battery.t <= air.span[1])
+        voltage = float(np.median(np.asarray(battery.fields["voltage_v"])[flown]))
+    capacity = next((c for p in ("BAT1_CAPACITY", "BAT_CAPACITY") if (c := log.parameter(p) or 0) > 0), 0)
+    pack = ", ".join(
+        word
+        for word in (f"{cells:.0f} cells" if cells else "", f"{capacity:.0f} mAh" if capacity else "")
+        if word
+    )
+    aside = f" ({pack})" if pack else ""
+    if voltage is not None:
+        volts = Line(
+            "nominal_voltage", f"{voltage:.2f}", "V", f"median in the air, where hover_thrust holds{aside}"
+        )
+    elif cells:
+        volts = Line(
+            "nominal_voltage",
+            f"{CELL * cells:.1f}",
+            "V",
+            f"{CELL:g} V a cell, no voltage in the log{aside}",
+            False,
+        )
+    else:
+        volts = Line("nominal_voltage", "16.0", "V", "no battery in the log, a stand-in: MEASURE", False)
+    known = not source.endswith("FLY A HOVER")
+    return Line("hover_thrust", _number(hover), "of full collective", source, known), curve, volts
+
+
+def _hover(log: Log, air: Airborne | None) -> tuple[float | None, str]:
+    """The command that carried the vehicle in slow flight, and how it was measured."""
+    if air is None:
+        return None, ""
+    thrust = commanded_thrust(log, *air.span, motor_count(log))
+    if thrust is None or thrust.relative:
+        return None, ""
+    command = np.interp(air.clock, thrust.t, thrust.values)
+    rows = air.in_air & (command > 0.02) & (command < 0.98)
+    local = log.topic("vehicle_local_position", "z", "vx", "vy", "vz")
+    slow = rows
+    if local is not None:
+        speed = np.interp(air.clock, local.t, np.linalg.norm(local.stack("vx", "vy", "vz"), axis=1))
+        height = -np.interp(air.clock, local.t, local.fields["z"])
+        # On the ground the accelerometer feels gravity whatever the rotors do.
+        slow = rows & (speed < SLOW) & (height - ground_level(height, air)[0] > CLEAR)
+    if slow.sum() < SETTLED * RATE:
+        return None, ""
+    felt = log.topic("sensor_combined", *ACCELEROMETER)
+    if felt is None or felt.rate_within(*air.span) < FAST:
+        return float(np.median(command[slow])), f"median command of {slow.sum() / RATE:.0f} s of slow flight"
+    force = -float(np.median(period_mean(felt.t, felt.stack(*ACCELEROMETER), air.clock)[slow, 2]))
+    if not 0.5 * GRAVITY < force < 2.0 * GRAVITY:
+        return None, ""
+    hover = float(np.median(command[slow])) * GRAVITY / force
+    return hover, f"measured over {slow.sum() / RATE:.0f} s of slow flight, against the accelerometer"
+
+
+def _estimate(log: Log, air: Airborne | None) -> float | None:
+    """PX4's own estimate of the hover thrust, median in the air; None where it has none."""
+    topic = log.topic("hover_thrust_estimate", "hover_thrust")
+    if topic is None or air is None:
+        return None
+    flown = (topic.t >= air.span[0]) & (topic.t <= air.span[1]) & np.isfinite(topic.fields["hover_thrust"])
+    if topic.has("valid"):
+        flown &= topic.fields["valid"] > 0
+    return float(np.median(topic.fields["hover_thrust"][flown])) if flown.sum() > 5 else None
+
+
+def _dynamics(log: Log, simulated: bool) -> tuple[Line, ...]:
+    lag = log.parameter("SIH_T_TAU") if simulated else None
+    gains = ", ".join(f"{name} {value:g}" for name in GAINS if (value := log.parameter(name)) is not None)
+    motor = (
+        Line("motor_time_constant", _number(lag), "s", "SIH_T_TAU, the simulated motors'")
+        if lag
+        else Line("motor_time_constant", "0.0", "s", "not known to PX4; the effect motor_lag tells")
+    )
+    return (
+        Line("command_delay", "0.0", "s", "not known to PX4; the effect transport_delay tells"),
+        motor,
+        Line(
+            "rate_time_constant",
+            "0.0",
+            "s",
+            f"the effect rate_loop_lag tells{f' ({gains})' if gains else ''}",
+        ),
+    )
+
+
+def _text(log: Log, lines: tuple[Line, ...]) -> str:
+    words = " ".join(word for word in ("PX4", log.version, log.hardware and f"on {log.hardware}") if word)
+    missing = [line.key for line in lines if not line.complete]
+    head = [
+        f"# Drafted from {Path(log.origin).name} ({words}), world ENU, body FLU, SI units.",
+        "# It can be used as it is; what follows TO COMPLETE the log cannot tell:",
+        *_wrapped("TO COMPLETE: " + ", ".join(missing)),
+        "",
+    ]
+    body: list[str] = []
+    for line in lines:
+        unit = f"{line.unit}: " if line.unit else ""
+        marked = "" if line.complete else "TO COMPLETE. "
+        body += _wrapped(f"{marked}{unit}{line.source}")
+        body.append(f"{'' if line.stated else '# '}{line.key} = {line.value}")
+    return "\n".join([*head, *body]) + "\n"
+
+
+def _wrapped(text: str, width: int = 108) -> list[str]:
+    return [f"# {piece}" for piece in textwrap.wrap(text, width)]
+
+
+def _number(value: float) -> str:
+    """A TOML float of four digits."""
+    text = f"{value:.4g}"
+    return text if any(mark in text for mark in ".e") else f"{text}.0"
+
+
+def _rows(positions: np.ndarray) -> str:
+    return "[" + ", ".join("[" + ", ".join(_number(x) for x in row) + "]" for row in positions) + "]"
