@@ -14,8 +14,8 @@ IDLE_SHARE = 0.03
 turning).
 """
 
-# Ratios of PX4's default gains: MC_ROLLRATE_I and _D over _P, MC_YAWRATE_I over _P; 1/s, s, 1/s.
-_INTEGRAL, _DERIVATIVE, _YAW_INTEGRAL = 0.2 / 0.15, 0.003 / 0.15, 0.1 / 0.2
+# PX4's default MC_ROLLRATE_I over _P and MC_YAWRATE_I over _P, 1/s.
+_INTEGRAL, _YAW_INTEGRAL = 0.2 / 0.15, 0.1 / 0.2
 
 _YAW_HEADROOM = 0.15  # of a rotor's range that yaw may take from the collective, as PX4's MINIMUM_YAW_MARGIN
 
@@ -112,18 +112,16 @@ class RateController:
         ixx, iyy, izz = vehicle.inertia
         # Crossover well below the corner of rotor lag and half a control step; yaw has little authority.
         lag = vehicle.motor_time_constant + 1.5 * dt
-        crossover = min(0.37 / lag, 18.5)
+        crossover = min(0.5 / lag, 25.0)
         arm = believed_powertrain(vehicle).torque_per_thrust
         yaw_acceleration = arm * vehicle.mass * GRAVITY / izz
-        yaw = min(0.475 * crossover, 0.6 * yaw_acceleration)
-        # Derivative action adds to the inertia that the proportional gain turns.
-        gain = crossover / (1.0 - _DERIVATIVE * crossover)
+        yaw_crossover = min(0.35 * crossover, 0.6 * yaw_acceleration)
         self._gains = (
-            (gain * ixx, _INTEGRAL * gain * ixx, _DERIVATIVE * gain * ixx),
-            (gain * iyy, _INTEGRAL * gain * iyy, _DERIVATIVE * gain * iyy),
-            (yaw * izz, _YAW_INTEGRAL * yaw * izz, 0.0),
+            (crossover * ixx, _INTEGRAL * crossover * ixx, 0.006 * crossover * ixx),
+            (crossover * iyy, _INTEGRAL * crossover * iyy, 0.006 * crossover * iyy),
+            (yaw_crossover * izz, _YAW_INTEGRAL * yaw_crossover * izz, 0.0),
         )
-        self._limits = (2.0 * gain * ixx, 2.0 * gain * iyy, 0.5 * yaw_acceleration * izz)
+        self._limits = (2.0 * crossover * ixx, 2.0 * crossover * iyy, 0.5 * yaw_acceleration * izz)
         self._smooth = 1.0 - math.exp(-2 * math.pi * 30.0 * dt)
         self.reset()
 
