@@ -169,6 +169,96 @@ def run(
     _tell(_summary(autopilot), f"stopped after {autopilot.time_us * 1e-6:.1f} s of simulated time", as_json)
 
 
+@app.command(epilog="Example: sim-bridge sitl --vehicle vehicle.toml --hidden rotor_drag --set-params")
+def sitl(
+    vehicle: VehicleFile = None,
+    config: Config = None,
+    hidden: HiddenNames = None,
+    hidden_count: HiddenCount = None,
+    seed: Seed = None,
+    sealed: Sealed = None,
+    noise: NoiseScale = None,
+    charge: Charge = None,
+    battery_age: BatteryAge = None,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; 0.0.0.0 for a PX4 on another machine.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(help="TCP port; PX4's instance i (`px4 -i 1`) connects to 4560 + i.")
+    ] = 4560,
+    link_port: Annotated[
+        int | None,
+        typer.Option(help="UDP port for PX4's parameters; default 14030 + i; 0: none.", min=0, max=65535),
+    ] = None,
+    set_params: Annotated[
+        bool, typer.Option("--set-params", help="Set PX4's control allocation to the vehicle's.")
+    ] = False,
+    show_params: Annotated[
+        bool, typer.Option("--show-params", help="Print what PX4 must have, as its commands, and end.")
+    ] = False,
+    position: Annotated[
+        str, typer.Option(help="What tells PX4 where it is: gps, vision (ODOMETRY) or both.")
+    ] = "gps",
+    vision_rate: Annotated[float, typer.Option(help="Rate of vision, Hz.", min=1, max=250)] = 50.0,
+    speed: Annotated[
+        float | None, typer.Option(help="Simulated over wall time; 0: as fast as it goes.")
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="End after so many s of simulated time; 0: never.")
+    ] = None,
+    truth: Annotated[Path | None, typer.Option(help="CSV to write the true motion to, 125 Hz.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Be the simulator of a real PX4 (SITL): the same vehicle, world and hidden effects as `run`, flown by PX4 itself.
+
+    PX4 connects to a TCP port and both advance in lockstep: its clock is simulated time. Start PX4 in a working
+    folder of its own with PX4_SIM_MODEL=none_iris. Before it arms, its control allocation is compared with the vehicle
+    file; a difference ends with exit code 2. docs/px4.md tells the whole way.
+    """
+    names = (
+        "vehicle",
+        "hidden",
+        "hidden_count",
+        "seed",
+        "sealed",
+        "noise",
+        "charge",
+        "battery_age",
+        "duration",
+    )
+    flags = {name: value for name, value in locals().items() if name in names}
+    settings = load_settings(config, flags, free_speed=speed)
+    believed = load_vehicle(settings.vehicle)
+    from sim_bridge.sitl.lockstep import Position
+    from sim_bridge.sitl.session import Request, fly, parameter_lines
+    from sim_bridge.truth.hidden import choose
+    from sim_bridge.world import check_vehicle
+
+    check_vehicle(believed)
+    kinds = [kind.value for kind in Position]
+    if position not in kinds:
+        raise InputError(f"--position {position}: choose one of {', '.join(kinds)}")
+    if show_params:
+        lines = parameter_lines(believed, Position(position))
+        _tell({"commands": lines}, "\n".join(lines), as_json)
+        return
+    effects = choose(list(settings.hidden), believed, settings.seed, settings.hidden_count)
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda caught, frame: stopped.append(caught))
+    default = Path(f"hidden-seed-{settings.seed}.sealed")
+    fly(
+        believed,
+        effects,
+        settings,
+        Request(host, port, link_port, Position(position), vision_rate, set_params, truth),
+        lambda: _seal(settings, effects, believed, default),
+        lambda answer: _told(settings, answer),
+        lambda: bool(stopped),
+        as_json,
+    )
+
+
 def _summary(autopilot: Autopilot) -> dict[str, Any]:
     return {"simulated": autopilot.time_us * 1e-6, "armed": autopilot.armed, "mode": autopilot.mode.name}
 

@@ -14,6 +14,9 @@ IDLE_SHARE = 0.03
 turning).
 """
 
+# PX4's default MC_ROLLRATE_I over _P and MC_YAWRATE_I over _P, 1/s.
+_INTEGRAL, _YAW_INTEGRAL = 0.2 / 0.15, 0.1 / 0.2
+
 _YAW_HEADROOM = 0.15  # of a rotor's range that yaw may take from the collective, as PX4's MINIMUM_YAW_MARGIN
 
 
@@ -114,9 +117,9 @@ class RateController:
         yaw_acceleration = arm * vehicle.mass * GRAVITY / izz
         yaw_crossover = min(0.35 * crossover, 0.6 * yaw_acceleration)
         self._gains = (
-            (crossover * ixx, 0.18 * crossover**2 * ixx, 0.006 * crossover * ixx),
-            (crossover * iyy, 0.18 * crossover**2 * iyy, 0.006 * crossover * iyy),
-            (yaw_crossover * izz, 0.12 * yaw_crossover**2 * izz, 0.0),
+            (crossover * ixx, _INTEGRAL * crossover * ixx, 0.006 * crossover * ixx),
+            (crossover * iyy, _INTEGRAL * crossover * iyy, 0.006 * crossover * iyy),
+            (yaw_crossover * izz, _YAW_INTEGRAL * yaw_crossover * izz, 0.0),
         )
         self._limits = (2.0 * crossover * ixx, 2.0 * crossover * iyy, 0.5 * yaw_acceleration * izz)
         self._smooth = 1.0 - math.exp(-2 * math.pi * 30.0 * dt)

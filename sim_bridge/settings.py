@@ -1,4 +1,4 @@
-"""Settings of `sim-bridge run` and `fly`: one commented TOML file, overridden by flags."""
+"""Settings of `sim-bridge run`, `sitl` and `fly`: one commented TOML file, overridden by flags."""
 
 from __future__ import annotations
 
@@ -75,8 +75,11 @@ _LIMITS = {
 }
 
 
-def load_settings(config: Path | None, flags: dict[str, Any]) -> Settings:
-    """Defaults, overridden by the file, overridden by the flags that are not None. Raises `InputError`."""
+def load_settings(config: Path | None, flags: dict[str, Any], free_speed: float | None = None) -> Settings:
+    """Defaults, overridden by the file, overridden by the flags that are not None. Raises `InputError`.
+
+    `free_speed` overrides the speed and may be 0: no limit, where nothing waits for the wall clock.
+    """
     values: dict[str, Any] = {}
     if config is not None:
         values.update(_read(config))
@@ -86,11 +89,16 @@ def load_settings(config: Path | None, flags: dict[str, Any]) -> Settings:
         values[name] = (
             str(value) if isinstance(value, Path) else tuple(value) if isinstance(value, list) else value
         )
+    free = free_speed == 0.0
+    if free_speed is not None and not free:
+        values["speed"] = free_speed
     settings = Settings(**values)
     for name, (low, high) in _LIMITS.items():
         if not low <= getattr(settings, name) <= high:
             option = "--" + name.replace("_", "-")
             raise InputError(f"{option} {getattr(settings, name):g} is outside {low:g} to {high:g}")
+    if free:
+        settings = replace(settings, speed=0.0)
     if not settings.vehicle:
         raise InputError("no vehicle; pass --vehicle FILE, or set `vehicle` in the configuration file")
     return settings

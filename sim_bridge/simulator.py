@@ -22,14 +22,16 @@ from sim_bridge.world import PHYSICS_STEP, World
 _STEP_US = round(PHYSICS_STEP * 1e6)
 _LEFT_GROUND = 0.05  # m above standing at which the time after take-off begins
 
-_Moment = tuple[
+Moment = tuple[
     int, list[float], list[float], tuple[float, float, float], tuple[float, ...], float, Sequence[float]
 ]
 """The arguments of `Sensors.sample`."""
 
+_Setpoint = tuple[float, float, float, float]  # collective and body rates, or four motor commands
+
 
 class Simulator:
-    """A vehicle that follows a normalised collective command and body rates (rad/s, FLU).
+    """A vehicle that follows a normalised collective command and body rates (rad/s, FLU), or four motor commands.
 
     The setpoint reaches the inner loop after the powertrain's delay; the inner loop, the rotors and the rigid
     body advance by 2 ms a step. `time_us` is the vehicle's clock: simulated time. `estimate` is what the vehicle
@@ -73,9 +75,9 @@ class Simulator:
         self._reported: Estimate | None = None
         # Samples on their way to the companion, oldest first; none are kept where it is told at once.
         late = round(self.sensors.delay / PHYSICS_STEP)
-        self._underway: deque[_Moment] | None = deque(maxlen=late + 1) if late else None
+        self._underway: deque[Moment] | None = deque(maxlen=late + 1) if late else None
         if self._underway is not None:
-            self._underway.append(self._moment())
+            self._underway.append(self.moment())
         self._flying_steps = 0
         self._events = after_takeoff(hidden, vehicle)
         self._ahead = list(self._events)
@@ -101,40 +103,52 @@ class Simulator:
         if self._underway is not None:
             # It has hovered there for a while: the first sample to arrive is of time zero.
             size = self._underway.maxlen or 1
-            still = self._moment()[1:]
+            still = self.moment()[1:]
             self.time_us = (size - 1) * _STEP_US
             self._underway.extend((i * _STEP_US, *still) for i in range(size))
 
     def step(self, command: float, p: float, q: float, r: float) -> None:
         """One physics step with the rotors running under a collective command and body-rate setpoints."""
-        line = self._line
-        size = len(line)
-        cursor = self._cursor + 1
-        if cursor == size:
-            cursor = 0
-        self._cursor = cursor
-        line[cursor] = (command, p, q, r)
-        newer = cursor - self._whole
-        c1, p1, q1, r1 = line[newer]
-        late = self._late
-        if late:
-            c0, p0, q0, r0 = line[newer - 1]
-            c1 += late * (c0 - c1)
-            p1 += late * (p0 - p1)
-            q1 += late * (q0 - q1)
-            r1 += late * (r0 - r1)
+        c1, p1, q1, r1 = self._delayed((command, p, q, r))
         if old := self._filter:
             p0, q0, r0 = self._asked
             self._asked = p1, q1, r1 = p1 + old * (p0 - p1), q1 + old * (q0 - q1), r1 + old * (r0 - r1)
         velocity = self._velocity.tolist()
         _, _, _, wx, wy, wz = velocity
         self.motors = motors = self.rates.motors(c1, p1, q1, r1, wx, wy, wz)
+        self._turn(velocity, motors)
+
+    def drive(self, motors: tuple[float, float, float, float]) -> None:
+        """One physics step under the motor commands (0 to 1) of an autopilot outside, which has an inner loop of its
+        own; the powertrain's delay acts on the commands.
+        """
+        self.motors = commands = list(self._delayed(motors))
+        self._turn(self._velocity.tolist(), commands)
+
+    def _delayed(self, setpoint: _Setpoint) -> _Setpoint:
+        """Put a setpoint into the delay line and take out the one that acts in this step."""
+        line = self._line
+        cursor = self._cursor + 1
+        if cursor == len(line):
+            cursor = 0
+        self._cursor = cursor
+        line[cursor] = setpoint
+        newer = cursor - self._whole
+        late = self._late
+        if not late:
+            return line[newer]
+        c1, p1, q1, r1 = line[newer]
+        c0, p0, q0, r0 = line[newer - 1]
+        return c1 + late * (c0 - c1), p1 + late * (p0 - p1), q1 + late * (q0 - q1), r1 + late * (r0 - r1)
+
+    def _turn(self, velocity: list[float], motors: list[float]) -> None:
+        """One physics step with the rotors under motor commands."""
         self.airframe.act(self._position.tolist(), velocity, motors, self._wrench)
         self._mj_step(self._model, self._data)
         self.time_us += _STEP_US
         self._estimate = None
         if self._underway is not None:
-            self._underway.append(self._moment())
+            self._underway.append(self.moment())
         if self._ahead:
             self._fly_on()
 
@@ -151,7 +165,7 @@ class Simulator:
         self.time_us += _STEP_US
         self._estimate = None
         if self._underway is not None:
-            self._underway.append(self._moment())
+            self._underway.append(self.moment())
         if self._flying_steps:
             self._flying_steps = 0
             self._ahead = list(self._events)
@@ -160,7 +174,7 @@ class Simulator:
     def estimate(self) -> Estimate:
         """What the vehicle believes of itself now; the same sample until the next step."""
         if self._estimate is None:
-            self._estimate = self.sensors.sample(*self._moment())
+            self._estimate = self.sensors.sample(*self.moment())
         return self._estimate
 
     def reported(self) -> Estimate:
@@ -172,7 +186,7 @@ class Simulator:
             self._reported = self.sensors.sample(*moment)
         return self._reported
 
-    def _moment(self) -> _Moment:
+    def moment(self) -> Moment:
         """The truth now, as `Sensors.sample` takes it."""
         m = self.airframe.motion
         velocity = self._velocity.tolist()

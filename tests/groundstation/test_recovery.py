@@ -244,7 +244,8 @@ def test_slow_rotors_are_not_taken_for_a_slow_rate_loop(folder) -> None:
     # so much noise that the thrust's lag cannot be seen in the acceleration, while the rates follow late because of it
     flight, _ = flown(folder, "motor_lag:0.05", 22)
     noise = np.random.default_rng(3).normal(0, 3.0, (len(flight), 3))
-    noisy = replace(flight, specific_force=flight.specific_force + noise)
+    quick = replace(flight.vehicle, rate_time_constant=0.035)
+    noisy = replace(flight, vehicle=quick, specific_force=flight.specific_force + noise)
     assert diagnosis(noisy).named("missing") == ()  # the rotors' speeds tell
     alone = diagnosis(replace(noisy, rotor_speed=None))
     assert alone.named("missing") == ()

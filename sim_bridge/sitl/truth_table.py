@@ -1,0 +1,53 @@
+"""The truth of a flight as a CSV with the project's column names, to lay beside PX4's own log."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from types import TracebackType
+
+from models.errors import InputError
+from models.flight import COLUMNS
+from sim_bridge.simulator import Simulator
+from sim_bridge.sitl.sensors import specific_force
+
+_COLUMNS = (
+    *("position", "velocity", "quaternion", "angular_velocity", "specific_force"),
+    *("battery_voltage", "rotor_speed", "motor_command"),
+)
+
+
+class TruthTable:
+    """Writes one row a call: time (s, PX4's clock), and the true state in ENU and FLU, z 0 where the vehicle stands."""
+
+    def __init__(self, path: Path, simulator: Simulator) -> None:
+        self._simulator = simulator
+        self._path = path
+        try:
+            self._stream = path.open("w", newline="", encoding="utf-8")
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot write the truth ({error.strerror}); choose --truth FILE"
+            ) from None
+        self._writer = csv.writer(self._stream)
+        self._writer.writerow(["t"] + [name for column in _COLUMNS for name in COLUMNS[column][0]])
+
+    def __enter__(self) -> TruthTable:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stream.close()
+
+    def row(self, time_us: int) -> None:
+        """Write the present state."""
+        simulator = self._simulator
+        _, position, velocity, acceleration, rotation, voltage, speeds = simulator.moment()
+        x, y, z = position[:3]
+        values = (
+            time_us * 1e-6,
+            *(x, y, z - simulator.world.standing_height, *velocity[:3], *position[3:], *velocity[3:]),
+            *(*specific_force(acceleration, rotation), voltage, *speeds, *simulator.motors),
+        )
+        self._writer.writerow([f"{value:.7g}" for value in values])
