@@ -79,10 +79,12 @@ def survey_command(
         _write(save, rows, fleet)
     if as_json:
         print_json(plain({"flights": [row_table(r) for r in rows], "fleet": asdict(fleet)}))
-        return
-    print_survey(rows, fleet, folder)
-    if save is not None:
-        console.print(f"saved in {save}: survey.jsonl, survey.parquet, fleet.json", highlight=False)
+    else:
+        print_survey(rows, fleet, folder)
+        if save is not None:
+            console.print(f"saved in {save}: survey.jsonl, survey.parquet, fleet.json", highlight=False)
+    if fleet.failed == fleet.flights:
+        raise InputError(f"{folder}: none of its {fleet.flights} flights could be used; see why above")
 
 
 def _already(save: Path, files: Sequence[Path]) -> list[Row]:
