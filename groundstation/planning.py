@@ -24,6 +24,7 @@ from groundstation.expected import Reference, expected_behaviour
 from groundstation.fitting import (
     BLOCK,
     HAC_LAG,
+    SCALE,
     UNMODELLED,
     Problem,
     critical_value,
@@ -580,15 +581,16 @@ class _Study:
         found = []
         for c, own in zip(self.candidates, self.own, strict=True):
             labels = [(n, p) for n in c.names for p in self.known[n].parameters]
+            values = [
+                v[p.name] for v, n in zip(c.values, c.names, strict=True) for p in self.known[n].parameters
+            ]
             halves = []
             for information, duration in ((before, seconds), (after, planned)):
                 if information is None or duration is None:
                     halves.append([None] * len(own))
                     continue
-                halves.append((critical_value(duration) * self._deviations(information, own)).tolist())
-            values = [
-                v[p.name] for v, n in zip(c.values, c.names, strict=True) for p in self.known[n].parameters
-            ]
+                statistical = critical_value(duration) * self._deviations(information, own)
+                halves.append(np.hypot(statistical, SCALE * np.array(values)).tolist())
             for (name, p), value, was, will in zip(labels, values, *halves, strict=True):
                 found.append(Precision(name, p.name, p.unit, value, was, will))
         return tuple(found)

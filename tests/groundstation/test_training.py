@@ -185,10 +185,13 @@ def test_lag_that_the_base_lacks_is_told_apart_from_what_a_network_can_learn(
     flights, trained, samples
 ) -> None:
     quick = replace(flights[0].vehicle, motor_time_constant=0.0, command_delay=0.0)
-    misled = samples_of_flights([replace(f, vehicle=quick) for f in flights], rigid_body_model(quick))
+    # and commands logged two samples before they were given
+    early = [np.append(f.thrust_command[2:], f.thrust_command[-2:]) for f in flights]
+    late = [replace(f, vehicle=quick, thrust_command=u) for f, u in zip(flights, early, strict=True)]
+    misled = samples_of_flights(late, rigid_body_model(quick))
     shares = memory_share(samples, trained), memory_share(misled, train(misled, QUICK, (32, 32), seed=1))
-    assert shares[0] < 0.5 * MATERIAL_MEMORY
-    assert shares[1] > 2 * MATERIAL_MEMORY
+    assert shares[0] < 0.1 * MATERIAL_MEMORY
+    assert shares[1] > MATERIAL_MEMORY
 
 
 def test_flight_that_is_too_short_is_left_out_and_told_of(flights, base, samples) -> None:
