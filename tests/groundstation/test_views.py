@@ -183,12 +183,16 @@ def test_where_it_fails_is_drawn_in_the_colours_of_the_error(recordings, environ
         "480x270",
         recordings / "where.rrd",
     ]
-    told = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
-    if not picture.exists():
-        pytest.skip(f"no renderer here: {told.stderr.strip().splitlines()[-1:]}")
-    seen = pixels(picture)[..., :3].reshape(-1, 3).astype(int)
     scale = of_error(np.linspace(0.0, 1.0, 64), 1.0).astype(int)
-    near = [np.any(np.abs(seen - colour).sum(axis=1) < 40) for colour in scale[::8]]
+    near: list[bool] = []
+    for _ in range(4):  # on a busy machine the viewer takes its picture before the recording is read
+        told = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+        if not picture.exists():
+            pytest.skip(f"no renderer here: {told.stderr.strip().splitlines()[-1:]}")
+        seen = pixels(picture)[..., :3].reshape(-1, 3).astype(int)
+        near = [bool(np.any(np.abs(seen - colour).sum(axis=1) < 40)) for colour in scale[::8]]
+        if sum(near) >= 6:
+            break
     assert sum(near) >= 6
 
 
