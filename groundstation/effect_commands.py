@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
-
-from models.errors import InputError
 
 console = Console()
 effect_app = typer.Typer(no_args_is_help=True, help="Write an effect of your own.")
@@ -90,23 +87,7 @@ def effect_new(
 
 
 def write_template(name: str, folder: Path) -> Path:
-    """Write the template of effect `name` into `folder`.
+    """Write the template of effect `name` into `folder`; raises as `write_effect_file`."""
+    from groundstation.effect_file import write_effect_file
 
-    Raises `InputError` for a name that is none or taken, and where the file exists or cannot be written.
-    """
-    from models.effects import catalogue
-
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise InputError(f"'{name}' is no name for an effect; use lower-case letters, digits and underscores")
-    if name in catalogue():
-        raise InputError(f"an effect named '{name}' exists already; choose another name")
-    path = folder / f"{name}.py"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(TEMPLATE.replace("NAME", name))
-    except FileExistsError:
-        raise InputError(f"{path} exists already; choose another name or --output") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot write it ({error.strerror}); choose another --output") from None
-    return path
+    return write_effect_file(name, TEMPLATE.replace("NAME", name), folder)

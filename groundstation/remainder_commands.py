@@ -74,8 +74,9 @@ def remainder_command(
     """
     from groundstation.as_json import plain
     from groundstation.diagnosis import diagnose
+    from groundstation.effect_file import write_effect_file
     from groundstation.reading import read_flight
-    from groundstation.sparse import write_effect
+    from groundstation.sparse import effect_source
 
     read = read_flight(flight, vehicle, mapping)
     base = base_for_diagnosis(model, read, store, effects)
@@ -88,7 +89,8 @@ def remainder_command(
                 f"{read.name}: no short formula holds what is left; "
                 + (left.advice or "nothing but noise is left of this flight")
             )
-        path = write_effect(left.formula, name, write, read.name, read.data_hash)
+        source = effect_source(left.formula, name, read.name, read.data_hash)
+        path = write_effect_file(name, source, write)
     if as_json:
         print_json(plain(_table(result, path)))
         return

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy import stats
@@ -21,7 +20,6 @@ from groundstation.measurement import Measurement
 from groundstation.results import FormulaTerm, SparseFormula
 from groundstation.surrogates import BURST, random_phases, random_signs
 from models.effect import Motion
-from models.errors import InputError
 from models.prediction import motion_of_flight
 
 ALPHA = 0.01
@@ -236,29 +234,6 @@ def _jackknife(
         for i, k in enumerate(terms, 1):
             found[(a, k)] = (float(all_of_it[i]), float(spread[i]))
     return [found[key] for key in chosen]
-
-
-def write_effect(formula: SparseFormula, name: str, folder: Path, flight: str, data_hash: str) -> Path:
-    """Write the formula as an effect of the user's own: `folder`/`name`.py.
-
-    Raises `InputError` for a name that is none or taken, and where the file exists or cannot be written.
-    """
-    from models.effects import catalogue
-
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise InputError(f"'{name}' is no name for an effect; use lower-case letters, digits and underscores")
-    if name in catalogue():
-        raise InputError(f"an effect named '{name}' exists already; choose another --name")
-    path = folder / f"{name}.py"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(effect_source(formula, name, flight, data_hash))
-    except FileExistsError:
-        raise InputError(f"{path} exists already; choose another --name or folder") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot write it ({error.strerror}); choose another folder") from None
-    return path
 
 
 def effect_source(formula: SparseFormula, name: str, flight: str, data_hash: str) -> str:

@@ -8,11 +8,12 @@ from scipy import signal
 from simulated import simulated
 
 from groundstation.diagnosis import diagnose
+from groundstation.effect_file import write_effect_file
 from groundstation.fitting import Problem, fit
 from groundstation.measurement import measure
 from groundstation.remainder import unexplained
 from groundstation.results import Unexplained
-from groundstation.sparse import TERMS, unit_of, write_effect
+from groundstation.sparse import TERMS, effect_source, unit_of
 from groundstation.store import add_effect
 from models.effects import effect_named
 from models.errors import InputError
@@ -80,7 +81,9 @@ def test_a_force_of_no_catalogue_entry_becomes_an_effect_that_explains_it(tmp_pa
     assert term.low < 0.12 < term.high
     assert "a_y = 0.12 u²" in left.where[0]
 
-    write_effect(left.formula, "side_force", tmp_path, hidden.name, hidden.data_hash)
+    write_effect_file(
+        "side_force", effect_source(left.formula, "side_force", hidden.name, hidden.data_hash), tmp_path
+    )
     effect = effect_named("side_force", str(tmp_path))
     assert "0123456789abcdef" in effect.citation
     base = rigid_body_model(hidden.vehicle, str(tmp_path))
@@ -91,7 +94,7 @@ def test_a_force_of_no_catalogue_entry_becomes_an_effect_that_explains_it(tmp_pa
     assert again.rms_after < 1.1 * again.noise_floor
     assert not again.unexplained.verdict
     with pytest.raises(InputError, match="exists already"):
-        write_effect(left.formula, "side_force", tmp_path, hidden.name, "")
+        write_effect_file("side_force", effect_source(left.formula, "side_force", hidden.name, ""), tmp_path)
 
 
 def test_a_constant_force_is_told() -> None:

@@ -1,0 +1,30 @@
+"""An effect of the user's own as a file: the one place that writes it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from models.effects import catalogue
+from models.errors import InputError
+
+
+def write_effect_file(name: str, source: str, folder: Path) -> Path:
+    """Write `source` of effect `name` as `folder`/`name`.py.
+
+    Raises `InputError` for a name that is none or taken, and where the file exists or cannot be written.
+    """
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise InputError(f"'{name}' is no name for an effect; use lower-case letters, digits and underscores")
+    if name in catalogue():
+        raise InputError(f"an effect named '{name}' exists already; choose another name")
+    path = folder / f"{name}.py"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(source)
+    except FileExistsError:
+        raise InputError(f"{path} exists already; choose another name or folder") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot write it ({error.strerror}); choose another folder") from None
+    return path
