@@ -182,6 +182,7 @@ class Director:
             "armed": latest.armed,
             "landed": latest.landed,
             "battery_voltage": round(latest.battery_voltage, 3),
+            "position": {} if latest.estimator is None else latest.estimator.describe(),
             "ready": not self.not_ready(),
             "not_ready": self.not_ready(),
             "mission": mission.identity if mission else "",
@@ -225,15 +226,8 @@ class Director:
     @property
     def lost_position(self) -> str:
         """'' where the estimator has a position that is good enough, or says nothing of it."""
-        accuracy, most = self.link.latest.position_accuracy, self.safety.position_accuracy
-        if accuracy <= most:
-            return ""
-        told = (
-            f"knows the position to {accuracy:.1f} m only" if math.isfinite(accuracy) else "has no position"
-        )
-        return (
-            f"the autopilot's estimator {told}; a flight needs {most:g} m (GPS, or mocap with EKF2_EV_CTRL)"
-        )
+        estimator = self.link.latest.estimator
+        return "" if estimator is None else estimator.refusal(self.safety.position_accuracy)
 
     def rates_too_low(self, rates: Rates | None) -> str:
         """'' where odometry and accelerometer arrive often enough, otherwise what is missing."""

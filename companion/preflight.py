@@ -243,7 +243,7 @@ def look(
     if pose is not None:
         progress("mocap poses")
         end = time.monotonic() + _FUSED_WITHIN
-        while (pose.why_not or link.latest.position_accuracy > settings.safety.position_accuracy) and (
+        while (pose.why_not or _without_position(link, settings)) and (
             time.monotonic() < (end if pose.status()["passed"] else end - 0.5 * _FUSED_WITHIN)
         ):
             time.sleep(0.1)
@@ -298,19 +298,45 @@ def _arming(link: VehicleLink, settings: Settings, vehicle: Vehicle | None) -> I
             state = FAIL if problem.level <= ERROR else WARN if problem.level == ERROR + 1 else NOTE
             yield Finding("arming", problem.text, "", problem.advice, state)
         if not report.reasons(streaming=False):
-            yield Finding("arming", "PX4 would arm", "", "once the companion streams setpoints", OK)
-    accuracy = link.latest.position_accuracy
-    if accuracy > 0.0:
-        good = accuracy <= settings.safety.position_accuracy
-        told = f"known to {accuracy:.2f} m" if math.isfinite(accuracy) else "none"
-        why = f"a flight needs {settings.safety.position_accuracy:g} m; PX4 itself would arm for Offboard without"
-        yield Finding("position", told, "", why, OK if good else FAIL)
+            why = "once the companion streams setpoints"
+            if _without_position(link, settings):
+                why += (
+                    "; PX4 arms for Offboard by body rates without a position, the companion does not (below)"
+                )
+            yield Finding("arming", "PX4 would arm", "", why, OK)
+    yield _position(link, settings)
     voltage = link.latest.battery_voltage
     if vehicle is not None:
         low = settings.safety.takeoff_voltage * vehicle.nominal_voltage
         state = NOTE if voltage == 0.0 else OK if voltage >= low else FAIL
         told = f"{voltage:.1f} V" if voltage else "not told"
         yield Finding("battery", told, "", f"a flight needs {low:.1f} V ([safety] takeoff_voltage)", state)
+
+
+def _without_position(link: VehicleLink, settings: Settings) -> str:
+    estimator = link.latest.estimator
+    return "" if estimator is None else estimator.refusal(settings.safety.position_accuracy)
+
+
+def _position(link: VehicleLink, settings: Settings) -> Finding:
+    most, estimator = settings.safety.position_accuracy, link.latest.estimator
+    wanted = f"a valid position, known to {most:g} m"
+    if estimator is None:
+        return Finding(
+            "position", "not told", wanted, "no ESTIMATOR_STATUS came; a flight goes without this check", NOTE
+        )
+    accuracy = estimator.position_accuracy
+    value = (
+        f"known to {accuracy:.2f} m"
+        if math.isfinite(accuracy)
+        else "accuracy not told"
+        if estimator.has_position
+        else "none"
+    )
+    told = f"the estimator says: {estimator.words}"
+    if accuracy <= most:
+        return Finding("position", value, wanted, told, OK)
+    return Finding("position", value, wanted, f"{told}. Wait for GPS, or give it mocap (EKF2_EV_CTRL)", FAIL)
 
 
 def _poses(feed: PoseFeed | None) -> Iterator[Finding]:

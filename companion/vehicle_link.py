@@ -36,6 +36,7 @@ from mavsdk.plugins.mocap.mocap import (
 )
 from mavsdk.plugins.param.param import Param, ParamError, ParamResult
 
+from companion.estimator import EstimatorStatus, estimator_status
 from companion.px4_events import ArmingChecks, ArmingReport, Px4Event, describe, unhealthy
 from models import frames
 from models.errors import InputError
@@ -72,7 +73,6 @@ _RESULTS = {
 }
 _ARMED = 128
 _CRITICAL, _TERMINATED = 5, 8  # MAV_STATE of a failsafe that acts, and of motors that are cut
-_POSITION, _HELD = 8 | 16, 128  # ESTIMATOR_POS_HORIZ_REL or _ABS; ESTIMATOR_CONST_POS_MODE
 _GROUND_STATION_HEARTBEAT = (
     '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
 )
@@ -122,8 +122,8 @@ class Latest:
     yet read: it arrives just before the odometry, and what it takes to read it would delay the setpoint.
     `killed` while the motors are cut (kill switch, termination), `failsafe` where the mode is one that the
     autopilot's failsafe chose, `unhealthy` what SYS_STATUS says is not well, `notices` what it told of failsafes,
-    switches and failed checks (monotonic s, text). `position_accuracy` is the estimator's own horizontal one, m:
-    infinite where it says that it has no position, 0 where it says nothing. PX4 sends odometry either way.
+    switches and failed checks (monotonic s, text). `estimator` is what the estimator says of itself, None before it
+    said anything. PX4 sends odometry whether or not that is a position.
     """
 
     battery_voltage: float = 0.0
@@ -137,7 +137,7 @@ class Latest:
     killed: bool = False
     failsafe: bool = False
     unhealthy: tuple[str, ...] = ()
-    position_accuracy: float = 0.0
+    estimator: EstimatorStatus | None = None
     notices: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=4))
 
     @property
@@ -519,7 +519,7 @@ class VehicleLink:
         )
 
     def _estimator(self, fields: dict[str, Any]) -> None:
-        self.latest.position_accuracy = position_accuracy(fields)
+        self.latest.estimator = estimator_status(fields)
 
     def _system_status(self, fields: dict[str, Any]) -> None:
         enabled = int(fields["onboard_control_sensors_enabled"])
@@ -563,14 +563,6 @@ def mode_name(custom_mode: int) -> str:
     """PX4's flight mode of a heartbeat, as MAVSDK names it."""
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
     return _MODES.get((main, sub), _MODES.get((main, 0), "UNKNOWN"))
-
-
-def position_accuracy(fields: dict[str, Any]) -> float:
-    """Horizontal accuracy (m) that an ESTIMATOR_STATUS tells; infinite where the estimator has no position."""
-    flags, accuracy = int(fields["flags"]), fields["pos_horiz_accuracy"]
-    if not flags & _POSITION or flags & _HELD or accuracy is None or not math.isfinite(accuracy):
-        return math.inf
-    return float(accuracy)
 
 
 def odometry_from_wire(fields: dict[str, Any]) -> Odometry | None:

@@ -407,6 +407,14 @@ def _follow_candidate(
                 return {"state": "staged", "reason": own[-1].text if own else ""}
 
 
+def _position(position: dict[str, Any]) -> str:
+    """What the autopilot's estimator says of its position."""
+    if not position:
+        return "the autopilot has told nothing of it"
+    told = "none" if not position["valid"] else "valid"
+    return f"{told} (received: {position['received']})"
+
+
 def _mocap(pose: dict[str, Any]) -> str:
     """Poses that the companion passes on; '' where it expects none."""
     if not pose:
@@ -464,6 +472,7 @@ def status_command(
             f"{'armed' if status['armed'] else 'disarmed'}",
         ),
         ("battery", f"{status['battery_voltage']:.2f} V"),
+        ("position", escape(_position(status.get("position") or {}))),
         ("received", rates or "not measured"),
         ("mocap", escape(_mocap(status.get("pose") or {}))),
         ("live model", escape(titles.get(status["live"], status["live"]))),

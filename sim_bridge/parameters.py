@@ -32,6 +32,7 @@ _TABLE: dict[str, Parameter] = {
     "COM_RCL_EXCEPT": Parameter(0, 0, 31),
     "COM_RC_IN_MODE": Parameter(1, 0, 4),
     "COM_RC_OVERRIDE": Parameter(1, 0, 3),
+    "EKF2_GPS_CTRL": Parameter(7, 0, 15),  # 0: no position at all, as the stand-in has no other source
     "EKF2_PREDICT_US": Parameter(2000, 1000, 20000),
     "GF_ACTION": Parameter(2, 0, 5),
     "GF_MAX_HOR_DIST": Parameter(0.0, 0.0, 10000.0),  # m

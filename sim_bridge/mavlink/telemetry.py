@@ -11,7 +11,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mav
 
-from sim_bridge.autopilot import Autopilot
+from sim_bridge.autopilot import Autopilot, Landed
 from sim_bridge.mavlink import wire
 from sim_bridge.mavlink.esc_status import ESC_STATUS, EscStatus
 from sim_bridge.modes import Mode
@@ -224,18 +224,30 @@ def _extended_state(a: Autopilot) -> Any:
 
 
 def _estimator_status(a: Autopilot) -> Any:
-    good = (
+    flags = (
         mav.ESTIMATOR_ATTITUDE
-        | mav.ESTIMATOR_VELOCITY_HORIZ
         | mav.ESTIMATOR_VELOCITY_VERT
-        | mav.ESTIMATOR_POS_HORIZ_REL
-        | mav.ESTIMATOR_POS_HORIZ_ABS
         | mav.ESTIMATOR_POS_VERT_ABS
         | mav.ESTIMATOR_POS_VERT_AGL
-        | mav.ESTIMATOR_PRED_POS_HORIZ_REL
-        | mav.ESTIMATOR_PRED_POS_HORIZ_ABS
     )
-    return mav.MAVLink_estimator_status_message(a.time_us, good, 0.02, 0.02, 0.02, 0.02, 0.0, 0.0, 0.03, 0.03)
+    at_rest = a.landed is Landed.ON_GROUND
+    if a.parameters["EKF2_GPS_CTRL"]:
+        accuracy = 0.03
+        flags |= (
+            mav.ESTIMATOR_VELOCITY_HORIZ
+            | mav.ESTIMATOR_POS_HORIZ_REL
+            | mav.ESTIMATOR_POS_HORIZ_ABS
+            | mav.ESTIMATOR_PRED_POS_HORIZ_REL
+            | mav.ESTIMATOR_PRED_POS_HORIZ_ABS
+        )
+    else:
+        # As PX4 1.17: without any source it makes a position up while it stands still, and tells it to be good.
+        accuracy = 0.02 if at_rest else 100.0
+    if at_rest:
+        flags |= mav.ESTIMATOR_CONST_POS_MODE  # PX4 since 1.16, whatever the position is worth
+    return mav.MAVLink_estimator_status_message(
+        a.time_us, flags, 0.02, 0.02, 0.02, 0.02, 0.0, 0.0, accuracy, 0.03
+    )
 
 
 def _home(a: Autopilot) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.vehicle_link import mode_name, odometry_from_wire, position_accuracy
+from companion.vehicle_link import mode_name, odometry_from_wire
 from models import frames
 
 LOCAL_NED, BODY_FRD = 1, 12
@@ -91,20 +91,3 @@ def test_an_unknown_frame_is_an_error_not_a_guess() -> None:
 )
 def test_modes_are_px4_s(custom_mode: int, name: str) -> None:
     assert mode_name(custom_mode) == name
-
-
-@pytest.mark.parametrize(
-    ("flags", "accuracy", "told"),
-    [
-        (895, 0.29, 0.29),  # PX4 1.15.2 with GPS
-        (
-            229,
-            101.3,
-            float("inf"),
-        ),  # the same without GPS and mocap: its odometry goes on, with finite numbers
-        (895, None, float("inf")),
-        (1, 0.1, float("inf")),
-    ],
-)
-def test_an_estimator_without_a_position_says_so(flags: int, accuracy: float | None, told: float) -> None:
-    assert position_accuracy({"flags": flags, "pos_horiz_accuracy": accuracy}) == told
