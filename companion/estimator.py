@@ -7,11 +7,11 @@ fields look as if they told something, and mislead:
 * constant position (128): up to 1.15 "no horizontal velocity", since 1.16 also "the vehicle stands still", which
   a vehicle with the best GPS does before every flight. Where there is no position neither of the two is set, in
   old and new releases alike, so nothing is lost by leaving this flag alone.
-* the accuracy: since 1.16 a vehicle without any position that stands still is held by a made-up one, and tells
-  0.01 to 0.02 m. It counts only where a position is valid.
+* the accuracy: a vehicle without any position that stands still is held by a made-up one, and tells 0.3 m (1.14) or
+  0.01 to 0.02 m (since 1.16). It counts only where a position is valid.
 
-The flags of predicted positions tell no more of dead reckoning than these two: they fall 7 s after the last GPS,
-the two after EKF2_NOAID_TOUT (5 s) since 1.16. Until then the accuracy grows.
+When GPS is lost the two fall after EKF2_NOAID_TOUT (5 s) since 1.16, after 7 s before; until then the accuracy
+grows. The flags of predicted positions fall no earlier.
 """
 
 from __future__ import annotations

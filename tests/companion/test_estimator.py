@@ -20,26 +20,43 @@ MOST = 2.0
 
 
 class Status(NamedTuple):
-    """One message. `source` says where it was recorded, or what it was derived from."""
+    """One message of a vehicle at rest, and whether it has a position to fly by."""
 
     release: str
     what: str
     flags: int
     accuracy: float | None
     flies: bool
-    source: str
 
 
-RECORDED = "recorded from that release in its own simulator SIH"
+# All recorded, from builds of these releases in PX4's own simulator SIH (1.15.2: in an earlier session).
 STATUSES = (
-    Status("1.15.2", "GPS, at rest", 895, 0.29, True, RECORDED),
-    Status("1.15.2", "no GPS, at rest", 229, 101.3, False, RECORDED),
-    Status("1.17.0", "GPS, at rest", 1023, 0.2851, True, RECORDED),
-    Status("1.17.0", "GPS lost for 3 s, at rest", 1023, 0.3952, True, RECORDED),
-    Status("1.17.0", "GPS lost for 5 s, at rest", 997, 1.3884, False, RECORDED),
-    Status("1.17.0", "GPS lost for 7 s, at rest", 229, 14.1534, False, RECORDED),
-    Status("1.17.0", "GPS lost for 15 s: made-up position", 229, 0.0159, False, RECORDED),
-    Status("1.17.0", "started without GPS: made-up position", 1253, 0.0131, False, RECORDED),
+    Status("1.14.4", "GPS", 831, 0.3111, True),
+    Status("1.14.4", "GPS lost, at once", 831, 0.4412, True),
+    Status("1.14.4", "GPS lost, after 9 s", 165, 14.1432, False),
+    Status("1.14.4", "GPS lost, after 20 s", 165, 0.3035, False),
+    Status("1.14.4", "started without GPS", 165, 0.3921, False),
+    Status("1.15.2", "GPS", 895, 0.29, True),
+    Status("1.15.2", "started without GPS", 229, 101.3, False),
+    Status("1.15.4", "GPS", 895, 0.3007, True),
+    Status("1.15.4", "GPS lost, after 6 s", 229, 3.351, False),
+    Status("1.15.4", "started without GPS", 228, 61.0419, False),
+    Status("1.16.2", "GPS", 1023, 0.287, True),
+    Status("1.16.2", "GPS lost, after 4 s", 997, 1.4464, False),
+    Status("1.16.2", "GPS lost, after 6 s", 229, 14.1439, False),
+    Status("1.16.2", "GPS lost, after 20 s", 229, 0.0137, False),
+    Status("1.16.2", "started without GPS", 1253, 0.0129, False),
+    Status("1.17.0", "GPS", 1023, 0.2851, True),
+    Status("1.17.0", "GPS lost, at once", 1023, 0.3952, True),
+    Status("1.17.0", "GPS lost, after 4 s", 997, 1.3884, False),
+    Status("1.17.0", "GPS lost, after 6 s", 229, 14.1534, False),
+    Status("1.17.0", "GPS lost, after 14 s", 229, 0.0159, False),
+    Status("1.17.0", "started without GPS", 1253, 0.0131, False),
+    Status("1.18.0-beta1", "GPS", 1023, 0.2872, True),
+    Status("1.18.0-beta1", "GPS lost, after 4 s", 997, 1.4277, False),
+    Status("1.18.0-beta1", "GPS lost, after 6 s", 229, 14.2019, False),
+    Status("1.18.0-beta1", "GPS lost, after 20 s", 229, 0.0122, False),
+    Status("1.18.0-beta1", "started without GPS", 1253, 0.0132, False),
 )
 
 

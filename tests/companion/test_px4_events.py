@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import struct
+
 import pytest
 
-from companion.px4_events import CHECKS, ArmingChecks, Px4Event, describe, event_number, problem_of, unhealthy
+from companion.px4_checks import CHECKS
+from companion.px4_events import ArmingChecks, Px4Event, describe, event_number, problem_of, unhealthy
 
 # What PX4 1.15.2 sent after MAV_CMD_RUN_PREARM_CHECKS, some seconds after its start: number, levels, arguments.
 STARTING = (
@@ -83,12 +86,51 @@ def test_an_unknown_check_is_told_with_its_number() -> None:
         ("check_gf_violation_max_alt", 3, (), "above the autopilot's geofence"),
         ("failsafe_rc_override", 6, (), "the pilot took over with the sticks"),
         ("check_modes_offboard_signal", 3, (), ""),  # the end of every flight
+        ("check_modes_offboard_signal_lost", 3, (), ""),  # the same in 1.18
+        ("check_estimator_gnss_fusion_stopped", 6, (), "the estimator no longer uses GPS"),
+        ("check_estimator_gnss_warning_spoofing", 1, (), "the GPS signal is spoofed"),
+        ("check_failure_detector_motor", 2, (1,), "a motor failed"),
+        ("commander_failsafe_enter_low_flight_time_warn", 4, (), "little flight time left: return advised"),
+        ("check_power_oc_periph", 3, (), "too much current from the 5 V supply of the ports"),
         ("check_rc_dl_no_dllink", 6, (), ""),
         ("something_new", 0, (), ""),
     ],
 )
 def test_what_is_told_in_flight(name: str, level: int, arguments: tuple[int, ...], text: str) -> None:
     assert describe(Px4Event(event_number(name), level, bytes(arguments))) == text
+
+
+# From the tables (all_events.json) that the builds of 1.17.0 and of 1.18.0 beta 1 make of their sources.
+NUMBERS = {
+    "check_estimator_gps_hor_pos_drift_too_high": 22494412,
+    "check_estimator_gnss_warning_spoofing": 25957751,
+    "check_estimator_gps_jamming_critical": 29557505,
+    "check_failure_detector_motor": 17443695,
+    "check_power_oc_periph": 22476331,
+    "check_navigator_failure_hagl": 17588137,
+    "commander_failsafe_enter_low_flight_time_warn": 19085767,
+    "check_escs_fault": 23725705,
+    "check_modes_offboard_signal_lost": 28241790,
+    "check_gnss_receiver_no_fix": 17904473,
+}
+
+
+def test_the_events_of_today_s_releases_have_their_numbers_and_words() -> None:
+    for name, number in NUMBERS.items():
+        problem = problem_of(Px4Event(number, 3, b""))
+        assert problem.name == name
+        assert "not known here" not in problem.text
+
+
+def test_missing_setpoints_stand_against_nobody_before_a_flight_in_any_release() -> None:
+    for name in ("check_modes_offboard_signal", "check_modes_offboard_signal_lost"):
+        checks = ArmingChecks()
+        checks.take(event(*STARTING[0]))
+        checks.take(Px4Event(event_number(name), 3, struct.pack("<I", 1 << 14)))
+        checks.take(event(*STARTING[-1]))
+        assert checks.report is not None
+        assert checks.report.reasons(streaming=False) == ()
+        assert len(checks.report.reasons(streaming=True)) == 1
 
 
 def test_no_two_names_have_the_same_number_and_each_has_words() -> None:
