@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
-import tomllib
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +15,7 @@ from companion.shadow import ShadowLimits
 from companion.watch import GuardLimits
 from companion.zenoh_session import ZenohSettings
 from models.errors import InputError
+from models.outside import is_number, read_toml, shown
 
 T = TypeVar("T")
 
@@ -73,12 +72,7 @@ def load_settings(path: str | Path | None) -> Settings:
     if path is None:
         return Settings()
     path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the configuration ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}; correct that line") from None
+    table = read_toml(path, "the configuration")
     settings = _filled(Settings(), table, str(path), "")
     changes: dict[str, Any] = {
         name: str(path.parent / getattr(settings, name))
@@ -113,20 +107,20 @@ def _value(default: Any, value: Any, where: str) -> Any:
     """`value` where it fits the type of `default`, otherwise `InputError`."""
     if hasattr(default, "__dataclass_fields__"):
         if not isinstance(value, dict):
-            raise InputError(f"{where} must be a section, not {value!r}")
+            raise InputError(f"{where} must be a section, not {shown(value)}")
         file, _, section = where.partition(": ")
         return _filled(default, value, file, section.strip("'"))
     if isinstance(default, bool):
         if not isinstance(value, bool):
-            raise InputError(f"{where} must be true or false, not {value!r}")
+            raise InputError(f"{where} must be true or false, not {shown(value)}")
         return value
     if isinstance(default, str):
         if not isinstance(value, str):
-            raise InputError(f"{where} must be a text, not {value!r}")
+            raise InputError(f"{where} must be a text, not {shown(value)}")
         return value
     if isinstance(default, tuple):
         if not isinstance(value, list):
-            raise InputError(f"{where} must be a list, not {value!r}")
+            raise InputError(f"{where} must be a list, not {shown(value)}")
         if default and isinstance(default[0], float):
             if len(value) != len(default):
                 raise InputError(f"{where} must have {len(default)} numbers, not {len(value)}")
@@ -137,11 +131,6 @@ def _value(default: Any, value: Any, where: str) -> Any:
 
 
 def _number(value: Any, where: str) -> float:
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float))
-        or not math.isfinite(value)
-        or value <= 0
-    ):
-        raise InputError(f"{where} must be a positive number, not {value!r}")
+    if not is_number(value) or value <= 0:
+        raise InputError(f"{where} must be a positive number, not {shown(value)}")
     return float(value)

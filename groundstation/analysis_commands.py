@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from models.errors import InputError
+from models.whole_file import write_whole
 
 if TYPE_CHECKING:
     from groundstation.side_by_side import SideBySide
@@ -552,9 +554,14 @@ def model_list(
             f"{store}: no model store here; 'groundstation model add' makes one, --store DIR names another"
         )
     names = [vehicle] if vehicle else sorted(p.name for p in store.iterdir() if p.is_dir())
-    models = [read_model(path) for name in names for path in versions(store, name)]
+    models, damaged = [], []
+    for path in (path for name in names for path in versions(store, name)):
+        try:
+            models.append(read_model(path))
+        except InputError as error:
+            damaged.append({"path": str(path), "error": str(error)})
     if as_json:
-        print_json([model_table(m) for m in models])
+        print_json([*(model_table(m) for m in models), *damaged])
         return
     table = Table()
     for column in ("vehicle", "version", "from", "effects", "fit RMS m/s²", "made"):
@@ -570,6 +577,8 @@ def model_list(
             m.created,
         )
     console.print(table)
+    for one in damaged:
+        console.print(escape(one["error"]), style="red", highlight=False)
 
 
 @model_app.command("show")
@@ -652,10 +661,7 @@ def model_export(
         check_vehicle(model, one)
     actuation = actuation_of(model, flights)
     data = export_onnx(model, *flights, actuation=actuation)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    temporary = output.with_name(output.name + ".part")
-    temporary.write_bytes(data)
-    temporary.replace(output)
+    write_whole(output, data, "the model", "choose another -o")
     left = not_exported(model)
     if as_json:
         print_json(

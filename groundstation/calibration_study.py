@@ -35,6 +35,7 @@ from models.errors import InputError
 from models.reference import trajectory
 from models.trajectory import Segment, Trajectory, transfer
 from models.vehicle import GRAVITY, Vehicle, load_vehicle
+from models.whole_file import write_whole
 
 SHARES = {0: 0.3, 1: 0.4, 2: 0.2, 3: 0.1}
 """Share of the flights with so many effects hidden in them."""
@@ -424,6 +425,4 @@ def forget_diagnoses(study: Study) -> None:
 
 def _write(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
-    partial = path.with_name(f".{path.name}.part")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    write_whole(path, text, "the study", "choose another --output")

@@ -42,6 +42,7 @@ from models.export import export_onnx, not_exported
 from models.flight import Flight
 from models.model import Model, rigid_body_model
 from models.vehicle import Vehicle, load_vehicle
+from models.whole_file import write_whole
 
 VEHICLE = Path(__file__).parent.parent / "models" / "vehicles" / "quad5" / "vehicle.toml"
 SURVEY: tuple[str, dict[str, float]] = ("excitation", {})
@@ -109,7 +110,9 @@ def _make(folder: Path) -> None:
             )
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    mark.write_text("made by groundstation demo, which may empty this folder\n", encoding="utf-8")
+    write_whole(
+        mark, "made by groundstation demo, which may empty this folder\n", "the mark of a demonstration"
+    )
 
 
 def _step(console: Console, title: str, command: str) -> None:
@@ -195,7 +198,8 @@ def _deploy_and_fly(console: Console, link: Link, folder: Path, model: Model, su
     file = folder / "correction.onnx"
     with console.status("exporting to ONNX"):
         flight = read_flight(survey)
-        file.write_bytes(export_onnx(model, flight, actuation=actuation_of(model, [flight])))
+        onnx = export_onnx(model, flight, actuation=actuation_of(model, [flight]))
+        write_whole(file, onnx, "the model", "choose another --output")
     answer = link.request("model", file.read_bytes(), 30.0)
     console.print(f"accepted by the companion: {answer.get('reason') or file.name}", highlight=False)
     for effect in not_exported(model):

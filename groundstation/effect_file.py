@@ -7,6 +7,7 @@ from pathlib import Path
 
 from models.effects import catalogue
 from models.errors import InputError
+from models.whole_file import write_whole
 
 
 def write_effect_file(name: str, source: str, folder: Path) -> Path:
@@ -19,12 +20,7 @@ def write_effect_file(name: str, source: str, folder: Path) -> Path:
     if name in catalogue():
         raise InputError(f"an effect named '{name}' exists already; choose another name")
     path = folder / f"{name}.py"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(source)
-    except FileExistsError:
-        raise InputError(f"{path} exists already; choose another name or folder") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot write it ({error.strerror}); choose another folder") from None
+    if path.exists():
+        raise InputError(f"{path} exists already; choose another name or folder")
+    write_whole(path, source, "the effect", "choose another folder", new=True)
     return path

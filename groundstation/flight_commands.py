@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from contextlib import nullcontext
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -15,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from models.errors import InputError
+from models.outside import toml_table
 
 if TYPE_CHECKING:
     from groundstation.linear_design import Loop
@@ -56,6 +56,7 @@ def flights_command(
     from rich.progress import track as progress
 
     from groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
+    from models.whole_file import is_hidden
 
     if not directory.is_dir():
         raise InputError(f"{directory}: no such folder; pass the one that holds your flights")
@@ -63,7 +64,7 @@ def flights_command(
     files = sorted(
         f
         for f in directory.rglob("*")
-        if f.suffix.lower() in endings and f.is_file() and not f.name.startswith(".")
+        if f.suffix.lower() in endings and f.is_file() and not is_hidden(f, directory)
     )
     shown = (
         files if as_json or len(files) < 4 else progress(files, "reading", console=console, transient=True)
@@ -160,7 +161,7 @@ def _record_facts(file: Path) -> dict[str, Any]:
     record = read_record(file)
     facts = {name: record.metadata.get(name, "") for name in ("trajectory", "controller", "model")}
     created = record.metadata.get("created_ns", "")
-    if created.isdigit():
+    if created.isdecimal() and len(created) < 20:
         facts["date"] = datetime.fromtimestamp(int(created) * 1e-9, UTC).strftime("%Y-%m-%d")
     return facts
 
@@ -219,7 +220,7 @@ def import_command(
         write_draft(drafted, draft)
         told |= {
             "vehicle_draft": str(draft),
-            "values": tomllib.loads(drafted.text),
+            "values": toml_table(drafted.text, str(draft)),
             "sources": {line.key: line.source for line in drafted.lines},
             "to_complete": list(drafted.to_complete),
         }
@@ -241,12 +242,15 @@ def _drafted(file: Path, target: Path, mass: float | None) -> Draft:
     from groundstation.reading.flight_file import ULOGS
     from groundstation.reading.px4_log import load_ulog
     from groundstation.vehicle_draft import draft_vehicle
+    from models.outside import unreadable
 
     if file.suffix.lower() not in ULOGS:
         raise InputError(f"{file}: only a PX4 ULog holds the parameters that a vehicle file is drafted from")
     if target.exists():
         raise InputError(f"{target}: there is a file already; a draft never replaces one, name another")
-    return draft_vehicle(load_ulog(file), mass)
+    log = load_ulog(file)
+    with unreadable(file, "the log", "copy it from the vehicle's card again"):
+        return draft_vehicle(log, mass)
 
 
 def _print_draft(drafted: Draft, target: Path, file: Path) -> None:
@@ -305,14 +309,7 @@ def design_command(
         )
     design = with_integral(design, believed)
     target = output or vehicle.with_name("design.json")
-    partial = target.with_name(f".{target.name}.part")
-    try:
-        save_design(design, partial)
-        partial.replace(target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot write the design ({error.strerror}); choose another -o") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    save_design(design, target)
     found, integral = loops(design, believed), integral_loops(design, believed)
     if as_json:
         typer.echo(

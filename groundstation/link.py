@@ -7,7 +7,6 @@ run on Zenoh's threads and must only enqueue.
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +20,7 @@ from groundstation.settings import Settings
 from models.contract import key
 from models.errors import InputError
 from models.record_pb2 import Event, Tick
+from models.whole_file import whole_file
 
 PIECE_TRIES = 3
 ENDED = ("finished", "failed", "aborted")
@@ -158,25 +158,19 @@ class Link:
         """
         if Path(name).name != name:
             raise InputError(f"record name '{name}' is not a file name; take one of the list")
-        folder.mkdir(parents=True, exist_ok=True)
-        target, partial = folder / name, folder / f".{name}.part"
+        target = folder / name
         offset, size = 0, 1
-        try:
-            with partial.open("wb") as file:
-                while offset < size:
-                    piece, size = self._piece(name, offset)
-                    file.write(piece)
-                    offset += len(piece)
-                    progress(offset, size)
-                    if not piece and offset < size:
-                        raise InputError(
-                            f"record '{name}': the companion sends nothing after {offset} bytes; ask again"
-                        )
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(target)
-        finally:
-            partial.unlink(missing_ok=True)
+        with whole_file(target, "the record", "choose another folder") as partial, partial.open("wb") as file:
+            while offset < size:
+                piece, size = self._piece(name, offset)
+                file.write(piece)
+                offset += len(piece)
+                progress(offset, size)
+                if not piece and offset < size:
+                    raise InputError(
+                        f"record '{name}': the companion sends nothing after {offset} bytes; ask again"
+                    )
+            file.flush()
         return target
 
     def follow(

@@ -21,6 +21,7 @@ from groundstation.analysis_commands import (
     print_json,
 )
 from models.errors import InputError
+from models.whole_file import write_whole
 
 if TYPE_CHECKING:
     from groundstation.planning import FlightPlan
@@ -97,10 +98,7 @@ def plan_command(
             raise InputError("pass a flight, or --vehicle with --between")
         gains = _design(design, believed, flight)
         plan = plan_flight(gains, believed, limits, diagnosis, between or (), directory, progress)
-    try:
-        output.write_text(setpoints(plan.trajectory), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{output}: cannot write the plan ({error.strerror})") from None
+    write_whole(output, setpoints(plan.trajectory), "the plan", "choose another -o")
     if as_json:
         print_json(
             plain(

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,9 @@ from models.errors import InputError
 from models.export import export_onnx
 from models.flight import Flight
 from models.model import Model, linear_model, rigid_body_model, write_model
+from models.outside import json_object, read_text
 from models.vehicle import load_vehicle
+from models.whole_file import write_whole
 
 UNSEEN = 100
 """Added to a seed for the trajectories of the scenarios: no training database holds them."""
@@ -179,14 +182,10 @@ def prepare(
     `truth` are words for `sim-bridge` that hide what is to be found. `tell` is called with what is done now.
     """
     kept = folder / "prepared.json"
-    if kept.exists():
-        table = json.loads(kept.read_text(encoding="utf-8"))
-        return Prepared(
-            seed,
-            {name: folder / file for name, file in table["files"].items()},
-            tuple(table["found"]),
-            table["figures"],
-        )
+    if (table := _told(kept, {"files": dict, "found": list, "figures": dict})) is not None:
+        files = {name: folder / str(file) for name, file in table["files"].items()}
+        if all(file.is_file() for file in files.values()):
+            return Prepared(seed, files, tuple(table["found"]), table["figures"])
     folder.mkdir(parents=True, exist_ok=True)
     tell("collect")
     collected = run_json(
@@ -225,10 +224,10 @@ def prepare(
             if tag and name != BOTH:
                 continue
             files[name + tag] = folder / f"{stem}{tag.replace(' ', '-')}.onnx"
-            files[name + tag].write_bytes(export_onnx(version, *flights, actuation=known))
+            write_whole(files[name + tag], export_onnx(version, *flights, actuation=known), "the model")
     figures |= {f"actuation: {k}": v for k, v in actuation.items()}
     table = {"files": {k: v.name for k, v in files.items()}, "found": list(found), "figures": figures}
-    kept.write_text(json.dumps(table, indent=1), encoding="utf-8")
+    write_whole(kept, json.dumps(table, indent=1), "what was prepared")
     return Prepared(seed, files, found, figures)
 
 
@@ -274,12 +273,29 @@ def _stem(scenario: Scenario, arm: Arm) -> str:
 def _kept(path: Path, fly: Callable[[Path], Flown]) -> Flown:
     """What is known of the flight at `path` (without suffix), flown now where nothing is."""
     kept = path.with_name(f"{path.name}.json")
-    if kept.exists():
-        table = json.loads(kept.read_text(encoding="utf-8"))
+    kinds = {
+        "seed": int, "scenario": str, "controller": str, "mse": list, "outcome": str, "guard": str, "through": str,
+    }  # fmt: skip
+    if (table := _told(kept, kinds)) is not None:
         return Flown(**{**table, "mse": tuple(table["mse"])})
+    path.with_name(f"{path.name}.mcap").unlink(
+        missing_ok=True
+    )  # of a run that was killed before it could tell
     flown = fly(path)
-    kept.write_text(json.dumps(asdict(flown)), encoding="utf-8")
+    write_whole(kept, json.dumps(asdict(flown)), "what was flown")
     return flown
+
+
+def _told(kept: Path, kinds: dict[str, type]) -> dict[str, Any] | None:
+    """What an earlier run kept in a file; None where there is none, or it is damaged: it is done again."""
+    if not kept.exists():
+        return None
+    try:
+        table = json_object(read_text(kept, "the study", "it is done again"), str(kept), "it is done again")
+    except InputError:
+        return None
+    whole = set(table) == set(kinds) and all(isinstance(table[key], kind) for key, kind in kinds.items())
+    return table if whole else None
 
 
 def _fly(

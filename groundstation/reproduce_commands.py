@@ -17,6 +17,8 @@ from rich.table import Table
 
 from groundstation.analysis_commands import print_json
 from models.errors import InputError
+from models.outside import read_text
+from models.whole_file import write_whole
 
 if TYPE_CHECKING:
     from groundstation.reproduce import Prepared, Scenario, Study
@@ -124,13 +126,13 @@ def _same_study(output: Path, asked: dict[str, Any]) -> None:
 
     path = output / "study.json"
     text = json.dumps(asked, indent=1)
-    if path.exists():
-        if path.read_text(encoding="utf-8") != text:
+    if path.exists() and path.stat().st_size:  # empty where an earlier version was killed
+        if read_text(path, "the study", "choose another --output") != text:
             raise InputError(f"{output}: holds another study (see {path.name}); choose another --output")
-    elif any(output.iterdir()):
+    elif any(p != path and not p.name.startswith(".") for p in output.iterdir()):
         raise InputError(f"{output}: holds files that are no study's; choose another --output")
     else:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text, "the study", "choose another --output")
 
 
 def _bar(quiet: bool) -> Progress:

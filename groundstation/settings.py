@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from models.errors import InputError
+from models.outside import is_number, read_toml, shown
+from models.vehicle import check_name
 
 TEXTS = ("name", "mode", "zenoh_config", "flights")
 
@@ -38,26 +40,26 @@ def load_settings(path: Path | None) -> Settings:
     """
     if path is None:
         return Settings()
-    from groundstation.reading.toml_file import read_toml
-
     known = {f.name for f in fields(Settings)}
     changes: dict[str, Any] = {}
-    for key, value in read_toml(path, "configuration").items():
+    for key, value in read_toml(path, "the configuration").items():
         if key not in known:
             close = difflib.get_close_matches(key, known, 1)
             hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(sorted(known))}"
             raise InputError(f"{path}: unknown key '{key}'; {hint}")
         if key == "timeout":
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.1 <= value <= 600:
-                raise InputError(f"{path}: 'timeout' must be 0.1 to 600 s, not {value!r}")
+            if not is_number(value) or not 0.1 <= value <= 600:
+                raise InputError(f"{path}: 'timeout' must be 0.1 to 600 s, not {shown(value)}")
             changes[key] = float(value)
         elif key in TEXTS:
             if not isinstance(value, str):
-                raise InputError(f"{path}: '{key}' must be a text, not {value!r}")
+                raise InputError(f"{path}: '{key}' must be a text, not {shown(value)}")
+            if key == "name" and value:
+                check_name(value, f"{path}: 'name'")
             in_file = key in ("zenoh_config", "flights") and value
             changes[key] = str(path.parent / value) if in_file else value
         else:
             if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-                raise InputError(f"{path}: '{key}' must be a list of texts, not {value!r}")
+                raise InputError(f"{path}: '{key}' must be a list of texts, not {shown(value)}")
             changes[key] = tuple(value)
     return replace(Settings(), **changes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +15,7 @@ from groundstation.rotation import fit_rotation
 from models.effects import effect_named
 from models.errors import InputError
 from models.flight import Flight
-from models.model import Model, Term, linear_model, read_model, rigid_body_model, write_model
+from models.model import Model, Term, Unfinished, linear_model, read_model, rigid_body_model, write_model
 from models.vehicle import Vehicle
 
 DEFAULT_STORE = Path("trueflight-models")
@@ -22,14 +23,25 @@ DEFAULT_STORE = Path("trueflight-models")
 
 def versions(store: Path, vehicle: str) -> list[Path]:
     """Files of the vehicle's model versions, oldest first."""
-    found = [p for p in (store / vehicle).glob("v*.json") if re.match(r"v\d{4}", p.name)]
-    return sorted(found)
+    found = [p for p in (store / vehicle).glob("v*.json") if _number(p)]
+    return sorted(found, key=lambda path: (_number(path), path.name))
 
 
 def newest(store: Path, vehicle: Vehicle, effects_directory: str | None = None) -> Model | None:
-    """The newest version of the vehicle's model; None where there is none yet."""
-    files = versions(store, vehicle.name)
-    return replace(read_model(files[-1]), effects_directory=effects_directory) if files else None
+    """The newest version of the vehicle's model; None where there is none yet. A file that a killed writer left is
+    told and passed by; any other that cannot be read is an `InputError`."""
+    for path in reversed(versions(store, vehicle.name)):
+        try:
+            return replace(read_model(path), effects_directory=effects_directory)
+        except Unfinished as error:
+            logging.getLogger(__name__).warning("%s", error)
+    return None
+
+
+def _number(path: Path) -> int:
+    """The number of the version in a file of this name; 0 where it is none."""
+    found = re.match(r"v([0-9]{4,6})[-.]", path.name)
+    return int(found[1]) if found else 0
 
 
 def find(store: Path, vehicle: str, which: str) -> Model:
@@ -39,7 +51,7 @@ def find(store: Path, vehicle: str, which: str) -> Model:
         return read_model(path)
     digits = which.lower().removeprefix("v")
     for file in versions(store, vehicle):
-        if digits.isdigit() and file.name.startswith(f"v{int(digits):04d}"):
+        if digits.isdecimal() and len(digits) < 7 and _number(file) == int(digits):
             return read_model(file)
     have = ", ".join(f.stem for f in versions(store, vehicle)) or "none yet"
     raise InputError(f"{store / vehicle}: no model version '{which}'; there are: {have}")
@@ -47,10 +59,12 @@ def find(store: Path, vehicle: str, which: str) -> Model:
 
 def lineage(store: Path, model: Model) -> list[Model]:
     """The models that led to `model`: the linear one, exact rotation, then every version."""
-    by_number = {m.version: m for m in map(read_model, versions(store, model.vehicle.name))}
-    line = [model]
-    while line[-1].parent is not None and line[-1].parent in by_number:
-        line.append(by_number[line[-1].parent])
+    by_number = {_number(path): path for path in versions(store, model.vehicle.name)}
+    line, parent = [model], model.parent
+    # A parent is always older: what a damaged file says of itself leads round in no circle.
+    while parent in by_number and parent is not None and (parent < line[-1].version or not line[-1].version):
+        line.append(replace(read_model(by_number[parent]), version=parent))
+        parent = line[-1].parent
     if line[-1].version != 0:
         line.append(rigid_body_model(model.vehicle, model.effects_directory))
     if line[-1].terms:
@@ -61,14 +75,7 @@ def lineage(store: Path, model: Model) -> list[Model]:
 def save(store: Path, model: Model, parent: Model | None) -> tuple[Model, Path]:
     """Write `model` as the next version, child of `parent`."""
     folder = store / model.vehicle.name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot make the model store ({error.strerror}); pass --store DIR"
-        ) from None
-    files = versions(store, model.vehicle.name)
-    number = 1 + max((read_model(f).version for f in files[-1:]), default=0)
+    number = 1 + max(map(_number, versions(store, model.vehicle.name)), default=0)
     stamped = replace(
         model,
         version=number,

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import stats
 
 from models.errors import InputError
+from models.whole_file import is_hidden, whole_file
 
 VERDICTS = ("missing", "possible", "not_supported", "not_excited", "included")
 
@@ -114,10 +115,7 @@ def flight_files(folder: Path) -> list[Path]:
     files = sorted(
         f
         for f in folder.rglob("*")
-        if f.suffix.lower() in endings
-        and f.is_file()
-        and not any(part.startswith(".") for part in f.relative_to(folder).parts)
-        and f.name != SAVED_TABLE
+        if f.suffix.lower() in endings and f.is_file() and not is_hidden(f, folder) and f.name != SAVED_TABLE
     )
     if not files:
         raise InputError(f"{folder}: no flights in it; known endings are {', '.join(endings)}")
@@ -382,9 +380,8 @@ def write_table(rows: Sequence[Row], path: Path) -> None:
             columns[f"{effect}_{parameter}{ending}"] = [
                 None if e is None else getattr(e, name) for e in found
             ]
-    temporary = path.with_name(path.name + ".part")
-    parquet.write_table(pa.table(columns), temporary)
-    temporary.replace(path)
+    with whole_file(path, "the survey", "pass another --save") as partial:
+        parquet.write_table(pa.table(columns), partial)
 
 
 def row_table(row: Row) -> dict[str, Any]:

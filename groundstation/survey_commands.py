@@ -21,6 +21,7 @@ from groundstation.analysis_commands import (
     print_json,
 )
 from models.errors import InputError
+from models.whole_file import write_whole
 
 if TYPE_CHECKING:
     from groundstation.survey import Fleet, Row
@@ -96,10 +97,10 @@ def _already(save: Path, files: Sequence[Path]) -> list[Row]:
         return []
     now = {str(f.resolve()): stamp_of(f) for f in files}
     found: dict[str, Row] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         try:
             row = row_from_table(json.loads(line))
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             # the last line of a run that was killed may be half a line
             console.print(f"{path}: line {number} is damaged; its flight is done again", style="yellow")
             continue
@@ -133,7 +134,7 @@ def _write(save: Path, rows: Iterable[Row], fleet: Fleet) -> None:
 
     write_table(list(rows), save / SAVED_TABLE)
     text = json.dumps(plain(asdict(fleet)), indent=1, allow_nan=False)
-    (save / "fleet.json").write_text(text + "\n", encoding="utf-8")
+    write_whole(save / "fleet.json", text + "\n", "the survey", "pass another --save")
 
 
 class _Bar:

@@ -217,11 +217,12 @@ def read_flights(
 
 def _flights_in(folder: Path) -> list[Path]:
     from groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
+    from models.whole_file import is_hidden
 
     endings = (*RECORDS, *TABLES, *ULOGS)
     found: dict[Path, Path] = {}
     for file in sorted(folder.rglob("*")):
-        if file.suffix.lower() not in endings or not file.is_file() or file.name.startswith("."):
+        if file.suffix.lower() not in endings or not file.is_file() or is_hidden(file, folder):
             continue
         known = found.get(file.with_suffix(""))
         if known is None or endings.index(file.suffix.lower()) < endings.index(known.suffix.lower()):
@@ -260,7 +261,7 @@ def _widths(text: str) -> tuple[int, ...]:
 
 def _numbers(option: str, text: str, most: int) -> tuple[int, ...]:
     parts = [p.strip() for p in text.split(",")]
-    if not all(p.isdigit() and 1 <= int(p) <= most for p in parts) or len(parts) > 20:
+    if not all(p.isdecimal() and len(p) < 6 and 1 <= int(p) <= most for p in parts) or len(parts) > 20:
         raise InputError(
             f"{option} {text}: give whole numbers from 1 to {most} with commas between, like 64,64"
         )

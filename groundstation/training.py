@@ -9,7 +9,6 @@ import hashlib
 import io
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -26,6 +25,8 @@ from models.contract import FEATURES, YAW_FEATURES
 from models.errors import InputError
 from models.export import sequential
 from models.network import Network, error_acceleration_of
+from models.outside import unreadable
+from models.whole_file import write_whole
 
 WIDTHS = (64, 64)
 """Hidden layers of the paper."""
@@ -307,10 +308,7 @@ class _Run:
         """Write the state after the last whole epoch, at once or not at all."""
         buffer = io.BytesIO()
         torch.save(self.last_state, buffer)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".part")
-        partial.write_bytes(buffer.getvalue())
-        os.replace(partial, path)
+        write_whole(path, buffer.getvalue(), "the checkpoint", "pass --store DIR")
 
     def restore(self, path: Path) -> None:
         """Go on from a checkpoint."""
@@ -327,16 +325,16 @@ class _Run:
             raise InputError(
                 f"{path}: of another training (flights, recipe, layers or seed); train without --resume"
             )
-        with torch.no_grad():
+        with unreadable(path, "the checkpoint", "train without --resume"), torch.no_grad():
             for mine, saved in zip(self.parameters, state["parameters"], strict=True):
                 mine.copy_(saved)
-        self.average, self.kept = state["average"], state["kept"]
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.generator.set_state(state["generator"])
-        self.history = [Epoch(**e) for e in state["history"]]
-        self.best, self.best_loss = state["best"], state["best_loss"]
-        self.waited, self.rate = state["waited"], state["rate"]
-        self.last_state = state
+            self.average, self.kept = state["average"], state["kept"]
+            self.optimiser.load_state_dict(state["optimiser"])
+            self.generator.set_state(state["generator"])
+            self.history = [Epoch(**e) for e in state["history"]]
+            self.best, self.best_loss = state["best"], state["best_loss"]
+            self.waited, self.rate = state["waited"], state["rate"]
+            self.last_state = state
 
     # --- the result -------------------------------------------------------------------------------------------------
 

@@ -6,9 +6,7 @@ value where it is from, and marks what its owner has to weigh, measure or check.
 
 from __future__ import annotations
 
-import os
 import textwrap
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +27,9 @@ from groundstation.reading.px4_flight import (
 from groundstation.reading.px4_log import Log
 from groundstation.reading.px4_thrust import commanded_thrust
 from models.errors import InputError
+from models.outside import toml_table
 from models.vehicle import GRAVITY, Vehicle, vehicle_from_table
+from models.whole_file import write_whole
 
 STAND_IN_MASS = 1.0  # kg
 CELL = 3.7  # V, a lithium cell in the middle of its discharge
@@ -89,24 +89,14 @@ def draft_vehicle(log: Log, mass: float | None = None) -> Draft:
         *_dynamics(log, simulated),
     )
     text = _text(log, lines)
-    return Draft(lines, text, vehicle_from_table(tomllib.loads(text), "draft"))
+    return Draft(lines, text, vehicle_from_table(toml_table(text, "draft"), "draft"))
 
 
 def write_draft(draft: Draft, path: Path) -> None:
     """Write a draft to a new file, whole or not at all. Raises `InputError` where there is one already."""
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(draft.text, encoding="utf-8")
-        os.link(partial, path)  # unlike a rename it never replaces a file
-    except FileExistsError:
-        raise InputError(
-            f"{path}: there is a vehicle file already; a draft never replaces one, name another"
-        ) from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot write the draft ({error.strerror}); choose another place") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    if path.exists():
+        raise InputError(f"{path}: there is a vehicle file already; a draft never replaces one, name another")
+    write_whole(path, draft.text, "the draft", "choose another place", new=True)
 
 
 def _name(log: Log) -> Line:

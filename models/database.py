@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from models.errors import InputError
+from models.outside import read_text
 from models.reference import trajectory
 from models.trajectory import Trajectory
+from models.whole_file import write_whole
 
 MINUTES = 30.0
 """Flight time of a database unless told otherwise, as in the paper."""
@@ -185,7 +187,7 @@ class Collection:
         try:
             if index.exists():
                 self._continue(index)
-            elif folder.exists() and any(folder.iterdir()):
+            elif folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir()):
                 raise InputError(f"{folder}: not empty, and no collection; choose another folder with -o")
             folder.mkdir(parents=True, exist_ok=True)
             self._write()
@@ -194,9 +196,12 @@ class Collection:
 
     def _continue(self, index: Path) -> None:
         try:
-            found = json.loads(index.read_text(encoding="utf-8"))
+            text = read_text(index, "the index of a collection", "choose another folder with -o")
+            if not text:  # of an earlier version that was killed at its start
+                return
+            found = json.loads(text)
             before, flights = dict(found["settings"]), dict(found["flights"])
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             raise InputError(
                 f"{index}: not the index of a collection; choose another folder with -o"
             ) from None
@@ -215,9 +220,7 @@ class Collection:
 
     def _write(self) -> None:
         index = {"settings": self.settings, "flights": dict(sorted(self.flown.items()))}
-        partial = self.folder / f".{INDEX}.part"
-        partial.write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
-        partial.replace(self.folder / INDEX)
+        write_whole(self.folder / INDEX, json.dumps(index, indent=1) + "\n", "the index of the collection")
 
 
 def record_name(number: int, sortie: Sortie) -> str:

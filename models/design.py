@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,15 @@ from typing import Any
 import numpy as np
 
 from models.errors import InputError
+from models.outside import is_number, json_object, numbers, read_text, shown
 from models.vehicle import GRAVITY, Vehicle
+from models.whole_file import write_whole
 
 Matrix = tuple[tuple[float, ...], ...]
 
+_MAKE_ONE = "make one with `groundstation design`"
+_LARGEST_GAIN = 1e6
+"""No gain of a vehicle comes near it, and eigenvalues overflow long after it."""
 _MASS_TOLERANCE = 0.01
 """Relative difference of mass up to which a design still belongs to a vehicle: the rounding of a scale."""
 
@@ -71,8 +75,8 @@ def hover_input_matrix(mass: float) -> np.ndarray:
 
 
 def save_design(design: Design, path: str | Path) -> None:
-    """Write a design file (JSON)."""
-    Path(path).write_text(design_to_json(design), encoding="utf-8")
+    """Write a design file (JSON), whole or not at all. Raises `InputError` where it cannot be written."""
+    write_whole(path, design_to_json(design), "the design", "choose another -o")
 
 
 def design_to_json(design: Design) -> str:
@@ -85,18 +89,7 @@ def design_to_json(design: Design) -> str:
 
 def load_design(path: str | Path, vehicle: Vehicle | None = None) -> Design:
     """Read and check a design file (and that it belongs to `vehicle`, where given). Raises `InputError`."""
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot read the design file ({error.strerror}); make one with `groundstation design`"
-        ) from None
-    except UnicodeDecodeError:
-        raise InputError(
-            f"{path}: not a design file (not text); make one with `groundstation design`"
-        ) from None
-    design = design_from_json(text, str(path))
+    design = design_from_json(read_text(Path(path), "the design file", _MAKE_ONE), str(path))
     if vehicle is not None:
         design.check(vehicle, str(path))
     return design
@@ -104,16 +97,11 @@ def load_design(path: str | Path, vehicle: Vehicle | None = None) -> Design:
 
 def design_from_json(text: str, where: str = "design") -> Design:
     """Check the text of a design file; `where` names it in error messages."""
-    try:
-        table = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{where}: not valid JSON: {error}; make one with `groundstation design`") from None
-    if not isinstance(table, dict):
-        raise InputError(f"{where}: not a design file; make one with `groundstation design`")
+    table = json_object(text, where, _MAKE_ONE)
     known = {f.name for f in fields(Design)}
     for key in table:
         if key not in known:
-            raise InputError(f"{where}: unknown key '{key}'; known keys: {', '.join(sorted(known))}")
+            raise InputError(f"{where}: unknown key {shown(key)}; known keys: {', '.join(sorted(known))}")
     for key in ("vehicle", "mass", "K_zeta", "K_eta"):
         if key not in table:
             raise InputError(f"{where}: '{key}' is missing; make the file again with `groundstation design`")
@@ -147,22 +135,14 @@ def _integral(where: str, table: object) -> IntegralGains | None:
 
 
 def _positive(where: str, key: str, value: object) -> float:
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float))
-        or not math.isfinite(value)
-        or value <= 0
-    ):
-        raise InputError(f"{where}: '{key}' must be a positive number, not {value!r}")
-    return float(value)
+    if not is_number(value) or value <= 0:  # type: ignore[operator]
+        raise InputError(f"{where}: '{key}' must be a positive number, not {shown(value)}")
+    return float(value)  # type: ignore[arg-type]
 
 
 def _matrix(where: str, key: str, value: object, shape: tuple[int, int]) -> Matrix:
-    try:
-        matrix = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != shape or not np.all(np.isfinite(matrix)):
+    matrix = numbers(value, shape)
+    if matrix is None or np.any(np.abs(matrix) > _LARGEST_GAIN):
         raise InputError(f"{where}: '{key}' must be {shape[0]} rows of {shape[1]} finite numbers")
     return tuple(tuple(float(x) for x in row) for row in matrix)
 
@@ -180,7 +160,10 @@ def _check_stability(design: Design, where: str) -> None:
         closed[:6, 6:], closed[6:, :3] = -b @ np.array(design.integral.K_i), np.eye(3)
         loops["integral"] = closed
     for key, closed in loops.items():
-        slowest = float(np.linalg.eigvals(closed).real.max())
+        try:
+            slowest = float(np.linalg.eigvals(closed).real.max())
+        except np.linalg.LinAlgError:
+            raise InputError(f"{where}: mass or {key} is beyond all sense; {_MAKE_ONE}") from None
         if slowest >= 0.0:
             raise InputError(
                 f"{where}: {key} gives an unstable loop (a pole at {slowest:+.3g} 1/s); "

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import codecs
+import os
 import sys
+import unicodedata
 from collections.abc import Callable
+
+_LONGEST = 1000
+"""Characters of a message; what stands in a damaged file may be of any length."""
 
 
 class InputError(Exception):
@@ -15,9 +21,60 @@ class InputError(Exception):
 
 
 def run_command_line(app: Callable[[], object]) -> None:
-    """Run a typer application; an `InputError` becomes one line on standard error and exit code 2."""
+    """Run a typer application; an `InputError` becomes one line on standard error and exit code 2.
+
+    So does a disk that is full, whatever was being written, and a terminal that cannot show a character shows the
+    nearest that it can.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors=_NEAREST)
     try:
         app()
     except InputError as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)  # noqa: T201
-        raise SystemExit(2) from None
+        _end(str(error))
+    except BrokenPipeError:  # whoever read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        raise SystemExit(1) from None
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _end(f"{place}{error.strerror or error}; free space, or check the permissions")
+    except MemoryError:
+        _end("not enough memory; give fewer or shorter files")
+
+
+def _end(message: str) -> None:
+    line = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in " ".join(message.split()))
+    if len(line) > _LONGEST:
+        line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
+    print(f"error: {line}", file=sys.stderr)  # noqa: T201
+    raise SystemExit(2) from None
+
+
+_NEAREST = "trueflight-nearest"
+_PLAIN = {
+    "²": "^2",
+    "³": "^3",
+    "→": "->",
+    "−": "-",
+    "–": "-",
+    "…": "...",
+    "·": "*",
+    "×": "x",
+    "°": " deg",
+    "µ": "u",
+}
+
+
+def _nearest(error: UnicodeError) -> tuple[str, int]:
+    """What stands for characters that an encoding lacks: an error handler of `codecs`."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    out = ""
+    for character in error.object[error.start : error.end]:
+        plain = _PLAIN.get(character) or unicodedata.normalize("NFKD", character)
+        out += "".join(c for c in plain if c.isascii()) or "?"
+    return out, error.end
+
+
+codecs.register_error(_NEAREST, _nearest)

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 from models.effect import Effect
 from models.effects import catalogue, effect_named
 from models.errors import InputError
 from models.network import Network, network_effect, network_from_table, network_table
+from models.outside import is_number, json_object, read_text, shown
 from models.vehicle import Vehicle, vehicle_from_table
+from models.whole_file import whole_file
+
+_RESTORE = "restore it from a copy"
+
+
+class Unfinished(InputError):
+    """A model version whose writer was killed: no version at all, and never one."""
 
 
 @dataclass(frozen=True)
@@ -87,51 +96,114 @@ def rigid_body_model(vehicle: Vehicle, effects_directory: str | None = None) -> 
 
 
 def write_model(model: Model, path: Path) -> None:
-    """Write a model version as JSON; raises `InputError` where the file exists: versions are never overwritten."""
+    """Write a model version as JSON, whole or not at all; raises `InputError` where the file exists: versions are never
+    overwritten."""
     table = asdict(replace(model, network=None))
     del table["network"]
     if model.network is not None:
         table["network"] = network_table(model.network)
     table["vehicle"] = {k: v for k, v in table["vehicle"].items() if k != "source" and v != ()}
     text = json.dumps({"trueflight_model": 1, **table}, indent=1)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text + "\n")
-    except FileExistsError:
-        raise InputError(f"{path}: this model version exists already and is never overwritten") from None
-    path.chmod(0o444)
+    with whole_file(path, "the model version", "pass --store DIR", new=True) as partial:
+        partial.write_text(text + "\n", encoding="utf-8")
+        partial.chmod(0o444)
 
 
 def read_model(path: Path) -> Model:
     """Read a model version; raises `InputError` for a missing, damaged or foreign file or an unknown effect."""
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot read the model ({error.strerror}); list what is there with 'model list'"
-        ) from None
-    except ValueError as error:
-        raise InputError(f"{path}: not a model file: {error}; restore it from a copy") from None
-    if not isinstance(table, dict) or table.pop("trueflight_model", None) != 1:
-        raise InputError(f"{path}: not a trueflight model file; pass one that 'model add' wrote")
-    try:
-        vehicle = vehicle_from_table(table.pop("vehicle"), f"{path}: vehicle")
-        terms = tuple(
-            Term(t["effect"], t["values"], {k: (v[0], v[1]) for k, v in t["intervals"].items()})
-            for t in table.pop("terms")
+    text = read_text(path, "the model", "list what is there with 'model list'")
+    if not text.strip("\0 \n"):
+        raise Unfinished(
+            f"{path}: empty, its writer was interrupted; remove it, other versions are not touched"
         )
-        learnt = table.pop("network", None)
-        network = None if learnt is None else network_from_table(learnt, f"{path}: network")
-        model = Model(vehicle=vehicle, terms=terms, network=network, **table)
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise InputError(f"{path}: damaged model file ({error}); restore it from a copy") from None
-    known = catalogue(model.effects_directory)
+    if not text.rstrip().endswith("}"):
+        raise Unfinished(f"{path}: ends in mid-write; remove it, other versions are not touched")
+    table = json_object(text, f"{path}: not a model file", _RESTORE)
+    if table.pop("trueflight_model", None) != 1:
+        raise InputError(f"{path}: not a trueflight model file; pass one that 'model add' wrote")
+    unknown = set(table) - {f.name for f in fields(Model)}
+    if unknown or "vehicle" not in table:
+        what = f"unknown key {shown(min(unknown))}" if unknown else "no vehicle"
+        raise InputError(f"{path}: damaged model file ({what}); {_RESTORE}")
+    if not isinstance(table["vehicle"], dict):
+        raise InputError(f"{path}: 'vehicle' must be an object, not {shown(table['vehicle'])}; {_RESTORE}")
+    learnt = table.get("network")
+    directory = _typed(path, table, "effects_directory", (str, type(None)), None)
+    terms = tuple(_term(path, one) for one in _typed(path, table, "terms", (list,), []))
+    _check_terms(path, terms, directory)
+    return Model(
+        vehicle=vehicle_from_table(table["vehicle"], f"{path}: vehicle"),
+        terms=terms,
+        name=_typed(path, table, "name", (str,), ""),
+        version=_typed(path, table, "version", (int,), 0),
+        parent=_typed(path, table, "parent", (int, type(None)), None),
+        data_hash=_typed(path, table, "data_hash", (str,), ""),
+        created=_typed(path, table, "created", (str,), ""),
+        fit=_figures(path, table),
+        effects_directory=directory,
+        network=None if learnt is None else network_from_table(learnt, f"{path}: network"),
+    )
+
+
+def _figures(path: Path, table: dict[str, Any]) -> dict[str, float]:
+    fit = _typed(path, table, "fit", (dict,), {})
+    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in fit.values()):
+        raise InputError(f"{path}: 'fit' is {shown(fit)}, not an object of numbers; {_RESTORE}")
+    return {name: float(value) for name, value in fit.items()}
+
+
+def _typed(path: Path, table: dict[str, Any], key: str, kinds: tuple[type, ...], default: Any) -> Any:
+    value = table.get(key, default)
+    if not isinstance(value, kinds) or isinstance(value, bool):
+        raise InputError(
+            f"{path}: '{key}' is {shown(value)}, not {' or '.join(k.__name__ for k in kinds)}; {_RESTORE}"
+        )
+    return value
+
+
+def _term(path: Path, table: object) -> Term:
+    """One effect of the file. An end of an interval may be infinite or unknown, a value may not."""
+    if not isinstance(table, dict) or set(table) != {"effect", "values", "intervals"}:
+        raise InputError(f"{path}: damaged model file (an effect is {shown(table)}); {_RESTORE}")
+    effect, values, intervals = table["effect"], table["values"], table["intervals"]
+    if not isinstance(effect, str) or not isinstance(values, dict) or not isinstance(intervals, dict):
+        raise InputError(f"{path}: damaged model file (an effect is {shown(table)}); {_RESTORE}")
+    for name, value in values.items():
+        if not is_number(value):
+            raise InputError(
+                f"{path}: {shown(effect)}: '{name}' is {shown(value)}, which is no number; {_RESTORE}"
+            )
+    for name, ends in intervals.items():
+        if (
+            not isinstance(ends, list)
+            or len(ends) != 2
+            or any(isinstance(end, bool) or not isinstance(end, int | float) for end in ends)
+        ):
+            raise InputError(
+                f"{path}: {shown(effect)}: the interval of '{name}' is {shown(ends)}; {_RESTORE}"
+            )
+    return Term(
+        effect,
+        {name: float(value) for name, value in values.items()},
+        {name: (float(low), float(high)) for name, (low, high) in intervals.items()},
+    )
+
+
+def _check_terms(path: Path, terms: tuple[Term, ...], directory: str | None) -> None:
+    """Every effect must be known, and have a number for each of its parameters and for nothing else."""
+    known = catalogue(directory)
     for term in terms:
         if term.effect not in known:
-            raise InputError(f"{path}: unknown effect '{term.effect}'; pass --effects DIR with its file")
-        missing = {p.name for p in known[term.effect].parameters} - set(term.values)
-        if missing:
+            raise InputError(f"{path}: unknown effect {shown(term.effect)}; pass --effects DIR with its file")
+        wanted = {p.name for p in known[term.effect].parameters}
+        if missing := wanted - set(term.values):
             raise InputError(
                 f"{path}: effect '{term.effect}' lacks the parameter {', '.join(sorted(missing))}"
             )
-    return model
+        if extra := set(term.values) - wanted:
+            raise InputError(
+                f"{path}: effect '{term.effect}' has no parameter {shown(min(extra))}; {_RESTORE}"
+            )
+    names = [term.effect for term in terms]
+    if len(set(names)) < len(names):
+        raise InputError(f"{path}: an effect stands in it twice; {_RESTORE}")

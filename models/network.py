@@ -20,6 +20,7 @@ from array_api_compat import array_namespace
 from models.contract import FEATURES, YAW_FEATURES
 from models.effect import Array, Effect, Motion, Stage
 from models.errors import InputError
+from models.outside import shown
 
 Layer = tuple[Array, Array]
 """Weights (outputs, inputs) and biases (outputs,)."""
@@ -231,6 +232,8 @@ def network_from_table(table: object, where: str) -> Network:
         recipe=_typed(table, "recipe", where, str, ""),
         fit=_typed(table, "fit", where, dict, {}),
     )
+    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in network.fit.values()):
+        raise InputError(f"{where}: 'fit' is {shown(dict(network.fit))}, not an object of numbers")
     if not np.all(network.scale > 0.0):
         raise InputError(f"{where}: 'scale' must be positive; restore the file from a copy")
     if not np.all(network.low <= network.high):
@@ -242,8 +245,12 @@ def network_from_table(table: object, where: str) -> Network:
 
 def _names(table: dict[str, Any], where: str) -> tuple[str, ...]:
     names, known = table.get("features"), {**FEATURES, **YAW_FEATURES}
-    if not isinstance(names, list) or not names or any(n not in known for n in names):
-        raise InputError(f"{where}: 'features' are {names!r}; known are {', '.join(known)}")
+    if (
+        not isinstance(names, list)
+        or not names
+        or any(not isinstance(n, str) or n not in known for n in names)
+    ):
+        raise InputError(f"{where}: 'features' are {shown(names)}; known are {', '.join(known)}")
     return tuple(names)
 
 
@@ -256,14 +263,16 @@ def _sizes(table: dict[str, Any], where: str) -> list[int]:
         and sizes[-1] == 3
     )
     if not fine:
-        raise InputError(f"{where}: 'sizes' is {sizes!r}; it must be inputs, hidden layers and 3 outputs")
+        raise InputError(
+            f"{where}: 'sizes' is {shown(sizes)}; it must be inputs, hidden layers and 3 outputs"
+        )
     return list(sizes)  # type: ignore[arg-type]
 
 
 def _typed(table: dict[str, Any], key: str, where: str, kind: type, default: Any) -> Any:
     value = table.get(key, default)
     if type(value) is not kind:
-        raise InputError(f"{where}: '{key}' is {value!r}, not of the kind {kind.__name__}")
+        raise InputError(f"{where}: '{key}' is {shown(value)}, not of the kind {kind.__name__}")
     return value
 
 

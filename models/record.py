@@ -12,23 +12,22 @@ import queue
 import struct
 import threading
 import time
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import BinaryIO
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from google.protobuf.message import DecodeError
-from mcap.exceptions import EndOfFile, InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.exceptions import EndOfFile, InvalidMagic
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from models.design import Design, design_from_json, design_to_json
 from models.errors import InputError
+from models.mcap_records import mcap_records
+from models.outside import toml_table, unreadable
 from models.record_pb2 import DESCRIPTOR, Event, Tick
 from models.vehicle import Vehicle, vehicle_from_table
 
@@ -214,42 +213,49 @@ def read_record(path: str | Path) -> FlightRecord:
     """
     path = Path(path)
     raw = _Raw()
-    try:
-        with path.open("rb") as stream:
-            end = _read_all(stream, raw)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the flight record ({error.strerror})") from None
-    except (InvalidMagic, struct.error):
-        raise InputError(f"{path}: not an MCAP file; give a record written by `companion`") from None
+    with unreadable(path, "the flight record", _OURS), path.open("rb") as stream:
+        end = _read_all(stream, raw)
     if not raw.ticks:
+        if end == _NO_MCAP:
+            raise InputError(f"{path}: {end}; {_OURS}")
         what = "other topics only" if raw.foreign else "no tick"
         raise InputError(f"{path}: holds {what}{'' if end is None else f' ({end})'}; nothing was flown in it")
     notes = []
     if end is not None:
         notes.append(f"the file is not whole ({end}); {len(raw.ticks)} ticks were recovered")
-    if int(raw.metadata.get("dropped", "0")):
-        notes.append(
-            f"{raw.metadata['dropped']} messages were dropped while recording: the disk was too slow"
-        )
+    if (dropped := raw.metadata.get("dropped", "0")) != "0":
+        notes.append(f"{dropped[:20]} messages were dropped while recording: the disk was too slow")
     vehicle = design = None
     if "vehicle.toml" in raw.attachments:
+        where = f"{path}:vehicle.toml"
         try:
-            table = tomllib.loads(raw.attachments["vehicle.toml"].decode())
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: its vehicle.toml is damaged: {error}; pass --vehicle FILE") from None
-        vehicle = vehicle_from_table(table, f"{path}:vehicle.toml")
+            vehicle = vehicle_from_table(
+                toml_table(_text(raw.attachments["vehicle.toml"], where), where), where
+            )
+        except InputError as error:
+            notes.append(f"its vehicle file is damaged: {error}")
     if "design.json" in raw.attachments:
-        design = design_from_json(raw.attachments["design.json"].decode(), f"{path}:design.json")
+        where = f"{path}:design.json"
+        try:
+            design = design_from_json(_text(raw.attachments["design.json"], where), where)
+        except InputError as error:
+            notes.append(f"its design file is damaged: {error}")
+    with unreadable(path, "the flight record", _OURS):
+        columns = tick_columns(raw.ticks)
     return FlightRecord(
-        str(path),
-        tick_columns(raw.ticks),
-        tuple(raw.events),
-        raw.metadata,
-        vehicle,
-        design,
-        end is not None,
-        tuple(notes),
-    )
+        str(path), columns, tuple(raw.events), raw.metadata, vehicle, design, end is not None, tuple(notes)
+    )  # fmt: skip
+
+
+_OURS = "give a record written by `companion`"
+_NO_MCAP = "not an MCAP file"
+
+
+def _text(attachment: bytes, where: str) -> str:
+    try:
+        return attachment.decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{where}: not text") from None
 
 
 @dataclass
@@ -261,53 +267,43 @@ class _Raw:
     foreign: bool = False
 
 
-def _read_all(stream: Any, raw: _Raw) -> str | None:
+def _read_all(stream: BinaryIO, raw: _Raw) -> str | None:
     """Collect every record; returns None for a proper end, otherwise how the file ended."""
     schemas: dict[int, str] = {}
     channels: dict[int, str] = {}
-    damaged = 0
+    damaged: list[str] = []
+    begun = False
     try:
-        for record in StreamReader(stream, emit_chunks=True, record_size_limit=1 << 28).records:
+        for record in mcap_records(stream, damaged):
+            begun = True
             if isinstance(record, Metadata):
                 raw.metadata.update(record.metadata)
             elif isinstance(record, Attachment):
                 raw.attachments[record.name] = record.data
-            elif isinstance(record, Chunk):
-                try:
-                    parts = breakup_chunk(record, validate_crc=True)
-                except Exception:  # noqa: BLE001 - each decompressor raises its own kind
-                    damaged += 1
-                    continue
-                _read_parts(parts, raw, schemas, channels)
-            else:
-                _read_parts([record], raw, schemas, channels)
+            elif isinstance(record, Schema):
+                schemas[record.id] = record.name
+            elif isinstance(record, Channel):
+                channels[record.id] = schemas.get(record.schema_id, "")
+            elif isinstance(record, Message):
+                _take(record, channels.get(record.channel_id, ""), raw)
     except EndOfFile:
-        return "cut off inside a chunk"
+        return "cut off inside a chunk" if begun else _NO_MCAP
     except (InvalidMagic, struct.error):
-        if not raw.ticks:
-            raise
-        return "its last bytes are missing"
-    except (McapError, DecodeError, ValueError, MemoryError) as error:
+        return "its last bytes are missing" if begun else _NO_MCAP
+    except OSError:
+        raise
+    except Exception as error:  # noqa: BLE001 - of a damaged file every library raises its own kind
         return f"damaged after {len(raw.ticks)} ticks: {error}"
-    return f"{damaged} damaged chunks" if damaged else None
+    return f"{len(damaged)} damaged chunks" if damaged else None
 
 
-def _read_parts(
-    parts: Iterable[McapRecord], raw: _Raw, schemas: dict[int, str], channels: dict[int, str]
-) -> None:
-    for record in parts:
-        if isinstance(record, Schema):
-            schemas[record.id] = record.name
-        elif isinstance(record, Channel):
-            channels[record.id] = schemas.get(record.schema_id, "")
-        elif isinstance(record, Message):
-            kind = channels.get(record.channel_id, "")
-            if kind == Tick.DESCRIPTOR.full_name:
-                raw.ticks.append(Tick.FromString(record.data))
-            elif kind == Event.DESCRIPTOR.full_name:
-                raw.events.append(Event.FromString(record.data))
-            else:
-                raw.foreign = True
+def _take(message: Message, kind: str, raw: _Raw) -> None:
+    if kind == Tick.DESCRIPTOR.full_name:
+        raw.ticks.append(Tick.FromString(message.data))
+    elif kind == Event.DESCRIPTOR.full_name:
+        raw.events.append(Event.FromString(message.data))
+    else:
+        raw.foreign = True
 
 
 _SCALARS = {

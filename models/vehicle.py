@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
+import re
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
 
 from models.errors import InputError
+from models.outside import is_number, numbers, read_toml, shown
 
 GRAVITY = 9.81
 """Standard gravity of the project, m/s²."""
 
 THRUST_MODELS = ("linear", "quadratic")
+
+LONGEST_NAME = 64
+"""Bytes of a vehicle's name."""
+MOST_ROTORS = 32
+"""Rotors of a vehicle file; more is damage."""
 
 _REQUIRED = ("name", "mass", "hover_thrust")
 # Physical sense of each number, wide: from a nano quadrotor (10 g) to a heavy lifter (100 kg).
@@ -83,16 +89,17 @@ def load_vehicle(path: str | Path) -> Vehicle:
     Raises `InputError` with file and field for a missing file, a syntax error, a misspelt or missing key, a wrong
     type, or a value without physical sense (a mass of 500).
     """
-    path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot read the vehicle file ({error.strerror}); pass --vehicle FILE"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}; correct that line") from None
-    return vehicle_from_table(table, str(path))
+    return vehicle_from_table(read_toml(Path(path), "the vehicle file", "pass --vehicle FILE"), str(path))
+
+
+def check_name(name: object, where: str) -> str:
+    """A name that may be part of a Zenoh key and of a file's name; raises `InputError` for any other."""
+    if isinstance(name, str) and re.fullmatch(r"\w[\w.+-]*", name) and len(name.encode()) <= LONGEST_NAME:
+        return name
+    raise InputError(
+        f"{where} is {shown(name)}; it must begin with a letter or digit and hold only letters, digits, '-', '_', '.' "
+        f"and '+', {LONGEST_NAME} bytes at most (it is part of Zenoh keys and file names)"
+    )
 
 
 def vehicle_from_table(table: dict[str, object], where: str) -> Vehicle:
@@ -110,8 +117,8 @@ def vehicle_from_table(table: dict[str, object], where: str) -> Vehicle:
     for key, value in table.items():
         if key in ("name", "thrust_model"):
             if not isinstance(value, str) or not value.strip():
-                raise InputError(f"{where}: '{key}' must be a text, not {value!r}")
-            values[key] = value
+                raise InputError(f"{where}: '{key}' must be a text, not {shown(value)}")
+            values[key] = check_name(value, f"{where}: name") if key == "name" else value
         elif key in ("inertia", "rotor_positions", "rotor_directions"):
             values[key] = _array(where, key, value)
         else:
@@ -120,10 +127,6 @@ def vehicle_from_table(table: dict[str, object], where: str) -> Vehicle:
     if vehicle.thrust_model not in THRUST_MODELS:
         raise InputError(
             f"{where}: thrust_model is '{vehicle.thrust_model}'; it must be one of {', '.join(THRUST_MODELS)}"
-        )
-    if "/" in vehicle.name or "*" in vehicle.name or " " in vehicle.name:
-        raise InputError(
-            f"{where}: name '{vehicle.name}' must not hold '/', '*' or blanks (it is part of a Zenoh key)"
         )
     if len(vehicle.rotor_positions) != len(vehicle.rotor_directions):
         raise InputError(
@@ -134,31 +137,29 @@ def vehicle_from_table(table: dict[str, object], where: str) -> Vehicle:
 
 
 def _number(where: str, key: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"{where}: '{key}' must be a number, not {value!r}")
+    if not is_number(value):
+        raise InputError(f"{where}: '{key}' must be a number, not {shown(value)}")
+    number = float(value)  # type: ignore[arg-type]
     low, high, unit = _RANGES[key]
-    if not low <= value <= high:
+    if not low <= number <= high:
         raise InputError(
-            f"{where}: {key} = {value:g} is outside {low:g} to {high:g} {unit}; check value and unit"
+            f"{where}: {key} = {number:g} is outside {low:g} to {high:g} {unit}; check value and unit"
         )
-    return float(value)
+    return number
 
 
 def _array(where: str, key: str, value: object) -> object:
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"{where}: '{key}' must be an array of numbers, not {value!r}") from None
     if key == "inertia":
-        if array.shape != (3,) or not (
-            np.all(np.isfinite(array)) and np.all(array >= 0) and np.all(array < 100)
-        ):
+        array = numbers(value, (3,))
+        if array is None or not (np.all(array >= 0) and np.all(array < 100)):
             raise InputError(f"{where}: 'inertia' must be three diagonal moments in kg m^2, each 0 to 100")
         return tuple(float(x) for x in array)
     if key == "rotor_positions":
-        if array.ndim != 2 or array.shape[1] != 3 or not np.all(np.abs(array) < 10):
+        array = numbers(value, (None, 3))
+        if array is None or len(array) > MOST_ROTORS or not np.all(np.abs(array) < 10):
             raise InputError(f"{where}: 'rotor_positions' must be a list of [x, y, z] in m, each below 10")
         return tuple(tuple(float(x) for x in row) for row in array)
-    if array.ndim != 1 or not np.all(np.isin(array, (-1, 1))):
+    array = numbers(value, (None,))
+    if array is None or len(array) > MOST_ROTORS or not np.all(np.isin(array, (-1, 1))):
         raise InputError(f"{where}: 'rotor_directions' must be a list of 1 and -1")
     return tuple(int(x) for x in array)

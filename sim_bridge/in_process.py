@@ -26,6 +26,7 @@ from models.record import FlightRecorder
 from models.record_pb2 import Event, Tick
 from models.trajectory import ReferenceSample, Trajectory, transfer
 from models.vehicle import Vehicle
+from models.whole_file import whole_file
 from sim_bridge.simulator import Simulator
 from sim_bridge.truth.battery import FULL, BatteryState
 from sim_bridge.truth.hidden import Hidden
@@ -228,14 +229,6 @@ def record(
 
     `on_sample` is called after each tick was taken down. Raises `InputError` where a file cannot be written.
     """
-    expected = plan.repeat * (plan.trajectory.duration + 60.0) * plan.rate
-    parameters = {f"parameter.{key}": str(value) for key, value in plan.trajectory.parameters.items()}
-    metadata = {"created_by": "sim-bridge", "trajectory": plan.trajectory.name, **parameters}
-    # Written after the flight: the recorder's thread would share the interpreter with the simulation and
-    # halve its speed. All of the flight has room in the queue, so that nothing is dropped.
-    recorder = FlightRecorder(
-        path, plan.vehicle, plan.design, metadata, queue_limit=int(expected) + 100, simulated=True
-    )
     tick = _TickWriter(plan)
     rows: list[tuple[float, ...]] = []
 
@@ -249,12 +242,23 @@ def record(
         for take in takers:
             take(sample)
 
-    try:
+    with whole_file(path, "the flight record", "choose another -o", new=True) as partial:
         flown = fly(plan, each if len(takers) > 1 else tick)
-    except BaseException:  # nothing has been written yet, and nothing half-written is left
-        recorder.close(timeout=60.0)
-        path.unlink(missing_ok=True)
-        raise
+        _write_record(plan, tick, flown, partial)
+        if table is not None:
+            _write_csv(table, rows, plan.rotor_speeds)
+    return flown
+
+
+def _write_record(plan: Plan, tick: _TickWriter, flown: Flown, path: Path) -> None:
+    """Write the record after the flight: the recorder's thread would share the interpreter with the simulation and
+    halve its speed."""
+    parameters = {f"parameter.{key}": str(value) for key, value in plan.trajectory.parameters.items()}
+    metadata = {"created_by": "sim-bridge", "trajectory": plan.trajectory.name, **parameters}
+    # All of the flight has room in the queue, so that nothing is dropped.
+    recorder = FlightRecorder(
+        path, plan.vehicle, plan.design, metadata, queue_limit=len(tick.messages) + 100, simulated=True
+    )
     try:
         for message, time_us, host in tick.messages:
             recorder.tick(message, time_us, host)
@@ -265,10 +269,7 @@ def record(
     finally:
         recorder.close(timeout=60.0)
     if recorder.error:
-        raise InputError(recorder.error)
-    if table is not None:
-        _write_csv(table, rows, plan.rotor_speeds)
-    return flown
+        raise InputError(recorder.error.replace(str(path), "the flight record"))
 
 
 class _TickWriter:
@@ -366,10 +367,10 @@ def _row(sample: Sample) -> tuple[float, ...]:
 def _write_csv(path: Path, rows: list[tuple[float, ...]], rotor_speeds: bool) -> None:
     names = ["t"] + [name for column in _TABLE_COLUMNS for name in COLUMNS[column][0]]
     kept = [i for i, name in enumerate(names) if rotor_speeds or name not in COLUMNS["rotor_speed"][0]]
-    try:
-        with path.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            writer.writerow([names[i] for i in kept])
-            writer.writerows([f"{row[i]:.7g}" for i in kept] for row in rows)
-    except OSError as error:
-        raise InputError(f"{path}: cannot write the table ({error.strerror})") from None
+    with (
+        whole_file(path, "the table", "choose another --csv") as partial,
+        partial.open("w", newline="", encoding="utf-8") as stream,
+    ):
+        writer = csv.writer(stream)
+        writer.writerow([names[i] for i in kept])
+        writer.writerows([f"{row[i]:.7g}" for i in kept] for row in rows)

@@ -15,6 +15,7 @@ from itertools import cycle
 from pathlib import Path
 
 from models.errors import InputError
+from models.whole_file import write_whole
 from sim_bridge.truth.hidden import Hidden
 
 _HEADER = "trueflight sealed answer 1: open it with `sim-bridge reveal`"
@@ -28,13 +29,8 @@ def seal(hidden: tuple[Hidden, ...], vehicle: str, seed: int, path: Path) -> Non
     # A constant length tells nothing of how many effects there are.
     packed = len(packed).to_bytes(4, "big") + packed.ljust(1020, b"\0")
     masked = hashlib.sha256(packed).digest() + _mask(packed)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(_HEADER + "\n" + base64.b85encode(masked).decode() + "\n", encoding="ascii")
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot write the sealed answer ({error.strerror}); choose --sealed FILE"
-        ) from None
+    text = _HEADER + "\n" + base64.b85encode(masked).decode() + "\n"
+    write_whole(path, text, "the sealed answer", "choose --sealed FILE")
 
 
 def reveal(path: Path) -> dict[str, object]:
@@ -57,7 +53,7 @@ def reveal(path: Path) -> dict[str, object]:
             raise ValueError("checksum")
         size = int.from_bytes(packed[:4], "big")
         answer: dict[str, object] = json.loads(zlib.decompress(packed[4 : 4 + size]))
-    except (ValueError, binascii.Error, zlib.error):
+    except (ValueError, binascii.Error, zlib.error, RecursionError):
         raise InputError(f"{path}: the sealed answer is damaged (its checksum does not match)") from None
     return answer
 

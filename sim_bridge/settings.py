@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from models.errors import InputError
+from models.outside import is_number, read_toml, shown
 from sim_bridge.truth.battery import BatteryState
 from sim_bridge.truth.sensors import NO_NOISE, Noise
 
@@ -54,11 +54,15 @@ class Settings:
         """Host and port of `mavlink`."""
         kind, _, address = self.mavlink.partition(":")
         host, _, port = address.rpartition(":")
-        if kind != "udpout" or not host or not port.isdigit() or not 0 < int(port) < 65536:
+        if kind != "udpout" or not host or not _is_port(port):
             raise InputError(
                 f"--mavlink {self.mavlink}: write udpout:HOST:PORT, such as udpout:127.0.0.1:14540"
             )
         return host, int(port)
+
+
+def _is_port(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) < 6 and 0 < int(text) < 65536
 
 
 _LIMITS = {
@@ -105,12 +109,7 @@ def load_settings(config: Path | None, flags: dict[str, Any], free_speed: float 
 
 
 def _read(config: Path) -> dict[str, Any]:
-    try:
-        table = tomllib.loads(config.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{config}: cannot read the configuration ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{config}: not valid TOML: {error}; correct that line") from None
+    table = read_toml(config, "the configuration")
     known = {f.name: f for f in fields(Settings)}
     values: dict[str, Any] = {}
     for key, value in table.items():
@@ -131,10 +130,14 @@ def _typed(config: Path, key: str, value: Any, default: Any) -> Any:
         items = [value] if isinstance(value, str) else value
         if isinstance(items, list) and all(isinstance(item, str) for item in items):
             return tuple(items)
-        raise InputError(f"{config}: '{key}' must be a list of texts, not {value!r}")
+        raise InputError(f"{config}: '{key}' must be a list of texts, not {shown(value)}")
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
+    if isinstance(default, dict) and isinstance(value, dict):
+        for name, number in value.items():
+            if not is_number(number):
+                raise InputError(f"{config}: '{key}.{name}' must be a number, not {shown(number)}")
     if type(value) is not type(default):
         kinds = {str: "a text", int: "a whole number", float: "a number", dict: "a table"}
-        raise InputError(f"{config}: '{key}' must be {kinds[type(default)]}, not {value!r}")
+        raise InputError(f"{config}: '{key}' must be {kinds[type(default)]}, not {shown(value)}")
     return value

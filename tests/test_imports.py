@@ -11,7 +11,7 @@ STANDARD = sys.stdlib_module_names
 EVERYWHERE = {"numpy", "typer", "rich", "models"}
 
 ALLOWED = {
-    "models": {"array_api_compat", "mcap", "google"},
+    "models": {"array_api_compat", "mcap", "lz4", "zstandard", "google"},
     "companion": {"companion", "mavsdk", "zenoh", "onnxruntime", "mcap", "google"},
     "groundstation": {
         "groundstation", "torch", "control", "scipy", "statsmodels", "rerun", "pyarrow", "pyulog", "onnx",

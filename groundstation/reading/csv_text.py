@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from models.errors import InputError
+from models.outside import unreadable
 
 MARKS = (
     (codecs.BOM_UTF8, "utf-8"),
@@ -33,10 +34,8 @@ class CsvText:
 
 def read_csv_text(path: Path) -> CsvText:
     """Read the text of a table. Raises `InputError` for a file that cannot be read or is empty."""
-    try:
+    with unreadable(path, "the flight", "check the path"):
         raw = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the flight ({error.strerror}); check the path") from None
     text, notes = _decoded(raw)
     if not text.strip():
         raise InputError(f"{path}: the file is empty; log the flight again or pass another file")

@@ -14,6 +14,7 @@ from groundstation.reading.table import Table, own_columns, read_table, unknown_
 from groundstation.reading.uniform import MOST_LOST, even_clock
 from models.errors import InputError
 from models.flight import Flight
+from models.outside import unreadable
 from models.vehicle import Vehicle, load_vehicle
 
 TABLES = (".csv", ".txt", ".tsv", ".parquet", ".pq")
@@ -33,6 +34,11 @@ def read_flight(
     `InputError`, in one line, for whatever makes the file unfit for analysis.
     """
     path = Path(path)
+    with unreadable(path, "the flight", "record or export it again"):
+        return _read_flight(path, vehicle, mapping)
+
+
+def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: str | Path | None) -> Flight:
     suffix = path.suffix.lower()
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the path (`groundstation flights DIR` lists flights)")

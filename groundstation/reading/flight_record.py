@@ -96,7 +96,8 @@ def _vehicle(path: Path, record: FlightRecord, vehicle: str | Path | Vehicle | N
     if vehicle is not None:
         return load_vehicle(vehicle)
     if record.vehicle is None:
-        raise InputError(f"{path}: the record holds no vehicle; pass --vehicle FILE")
+        damage = next((f" ({note})" for note in record.notes if "vehicle file" in note), "")
+        raise InputError(f"{path}: the record holds no vehicle{damage}; pass --vehicle FILE")
     return record.vehicle
 
 

@@ -33,7 +33,6 @@ from pathlib import Path
 import numpy as np
 
 from groundstation.reading.table import Table
-from groundstation.reading.toml_file import read_toml
 from models.errors import InputError
 from models.flight import COLUMNS
 from models.frames import (
@@ -44,6 +43,7 @@ from models.frames import (
     quaternion_from_euler,
     rotate_inverse,
 )
+from models.outside import numbers, read_toml, shown
 from models.vehicle import GRAVITY, Vehicle
 
 FRAMES = ("enu_flu", "ned_frd")
@@ -95,7 +95,7 @@ class MappedTable:
 def load_mapping(path: Path) -> Mapping:
     """Read and check a mapping file. Raises `InputError` with file and field for anything it does not
     know."""
-    source, table = str(path), read_toml(path, "mapping")
+    source, table = str(path), read_toml(path, "the mapping")
     frame = table.pop("frame", "enu_flu")
     _one_of(source, "frame", frame, FRAMES)
     known = [*COLUMNS, *_SPECIAL]
@@ -161,7 +161,7 @@ def _quantity(
     names = [names] if isinstance(names, str) else names
     if not isinstance(names, list) or len(names) != count or not all(isinstance(n, str) for n in names):
         what = 'column = "..."' if count == 1 else f"columns = [...] with {count} names"
-        raise InputError(f"{mapping.source}: [{name}] needs {what}, it has {names!r}")
+        raise InputError(f"{mapping.source}: [{name}] needs {what}, it has {shown(names)}")
     used.update(names)
     read = [table.column(n, f" for [{name}] of {mapping.source}") for n in names]
     values = read[0].copy() if count == 1 else np.stack(read, -1)
@@ -189,7 +189,7 @@ def _attitude(
         if axis == "pitch" and name == "from_acceleration":
             continue
         if not isinstance(name, str):
-            raise InputError(f'{source}: [attitude] needs {axis} = "column", it has {name!r}')
+            raise InputError(f'{source}: [attitude] needs {axis} = "column", it has {shown(name)}')
         used.add(name)
         angles[axis] = sign * factor * table.column(name, f" for [attitude] of {source}")
         high = float(np.nanquantile(np.abs(angles[axis]), 0.99)) if axis != "yaw" else 0.0
@@ -238,27 +238,25 @@ def _frame(mapping: Mapping, name: str) -> str:
 
 def _unit(source: str, name: str, given: object, wanted: str) -> tuple[float, float]:
     units = UNITS[wanted]
-    if given not in units:
+    if not isinstance(given, str) or given not in units:
         choices = [*units, "N"] if name == "thrust_command" else [*units]
-        raise InputError(f"{source}: [{name}] unit is {given!r}; it must be one of {', '.join(choices)}")
-    return units[str(given)]
+        raise InputError(f"{source}: [{name}] unit is {shown(given)}; it must be one of {', '.join(choices)}")
+    return units[given]
 
 
 def _signs(source: str, name: str, given: object, count: int) -> np.ndarray:
-    try:
-        signs = np.asarray(given, dtype=float)
-    except (TypeError, ValueError):
-        signs = np.zeros(1)
-    if signs.shape not in ((), (count,)) or not np.all(np.abs(signs) == 1):
+    one, each = numbers(given, ()), numbers(given, (count,))
+    signs = one if one is not None else each
+    if signs is None or not np.all(np.abs(signs) == 1):
         raise InputError(
-            f"{source}: [{name}] sign must be 1 or -1, or a list of {count} of them, not {given!r}"
+            f"{source}: [{name}] sign must be 1 or -1, or a list of {count} of them, not {shown(given)}"
         )
     return signs
 
 
 def _one_of(source: str, key: str, given: object, choices: tuple[str, ...]) -> None:
     if given not in choices:
-        raise InputError(f"{source}: {key} is {given!r}; it must be one of {', '.join(choices)}")
+        raise InputError(f"{source}: {key} is {shown(given)}; it must be one of {', '.join(choices)}")
 
 
 def _suggestion(word: str, known: list[str]) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from models.errors import InputError
+from models.outside import unreadable
 
 TOPICS = (
     "actuator_armed",
@@ -123,18 +123,16 @@ class Log:
 
 def load_ulog(path: Path) -> Log:
     """Read a ULog, also one that is cut short or damaged. Raises `InputError` for a file that is no ULog."""
+    with unreadable(path, "the log", "copy it from the vehicle's card again", "not a whole ULog"):
+        return _loaded(path)
+
+
+def _loaded(path: Path) -> Log:
     from pyulog import ULog
 
-    try:
-        # pyulog prints what it meets in a damaged file; we tell it ourselves.
-        with contextlib.redirect_stdout(io.StringIO()):
-            log = ULog(_Stream(io.FileIO(path)), message_name_filter_list=list(TOPICS))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the log ({error.strerror or error}); check the path") from None
-    except Exception as error:  # noqa: BLE001 - pyulog lets through whatever its parser meets
-        raise InputError(
-            f"{path}: not a whole ULog ({error}); copy it from the vehicle's card again"
-        ) from None
+    # pyulog prints what it meets in a damaged file; we tell it ourselves.
+    with contextlib.redirect_stdout(io.StringIO()), io.FileIO(path) as file:
+        log = ULog(_Stream(file), message_name_filter_list=list(TOPICS))
     notes = []
     if log.dropouts:
         lost = sum(d.duration for d in log.dropouts) / 1000
@@ -152,7 +150,7 @@ def load_ulog(path: Path) -> Log:
             (1e-6 * t, name, float(value)) for t, name, value in log.changed_parameters if _is_number(value)
         ),
         _version(release),
-        str(log.msg_info_dict.get("ver_hw", "")),
+        "".join(c for c in str(log.msg_info_dict.get("ver_hw", ""))[:40] if c.isprintable()),
         tuple(notes),
     )
 

@@ -9,21 +9,20 @@ missing: ENU and FLU (REP 103), unless their frame is named NED.
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
-from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Chunk, Header, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.exceptions import EndOfFile
+from mcap.records import Channel, Header, Message, Schema
 
 from groundstation.reading.px4_log import TOPICS, Log, collect
 from groundstation.reading.uniform import continuous_quaternion
 from models.errors import InputError
 from models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, rotate
+from models.mcap_records import mcap_records
 
 ADVICE = "record it with `ros2 bag record --storage mcap`, with the px4_msgs workspace sourced"
 OTHER_CLOCK = 60.0
@@ -52,12 +51,12 @@ def is_ros_bag(path: Path) -> bool:
     """Whether an MCAP file holds ROS 2 messages."""
     try:
         with path.open("rb") as stream:
-            for record in _records(stream, []):
+            for record in mcap_records(stream, []):
                 if isinstance(record, Header) and record.profile == "ros2":
                     return True
                 if isinstance(record, Channel):
                     return record.message_encoding == "cdr"
-    except (OSError, McapError, EndOfFile, struct.error, ValueError):
+    except Exception:  # noqa: BLE001 - whatever it is, it is no such recording; reading it will tell why
         return False
     return False
 
@@ -112,7 +111,7 @@ def _read(path: Path) -> tuple[list[_Recorded], str, list[str]]:
     cut = ""
     try:
         with path.open("rb") as stream:
-            for record in _records(stream, damaged):
+            for record in mcap_records(stream, damaged):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
@@ -143,20 +142,6 @@ def _read(path: Path) -> tuple[list[_Recorded], str, list[str]]:
     kept = [one for one, _ in channels.values() if len(one.rows) > 1]
     shown = ", ".join(sorted(seen)[:8]) + (" ..." if len(seen) > 8 else "")
     return kept, shown, notes
-
-
-def _records(stream: BinaryIO, damaged: list[str]) -> Iterator[Any]:
-    """Every record that is whole; a chunk that is not is skipped and noted in `damaged`."""
-    for record in StreamReader(stream, emit_chunks=True, record_size_limit=1 << 28).records:
-        if not isinstance(record, Chunk):
-            yield record
-            continue
-        try:
-            parts = breakup_chunk(record, validate_crc=True)
-        except Exception as error:  # noqa: BLE001 - each decompressor raises its own kind
-            damaged.append(str(error))
-            continue
-        yield from parts
 
 
 def _usable(topic: str, kind: str) -> bool:

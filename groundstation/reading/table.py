@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import io
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from groundstation.reading.csv_text import read_csv_text
 from models.errors import InputError
 from models.flight import COLUMNS
+from models.outside import shown, unreadable
 
 OWN_NAMES = tuple(name for names, _, _ in COLUMNS.values() for name in names)
 """Names of all columns of the project's own CSV, besides `t` and `flying`."""
@@ -34,6 +36,8 @@ NOTHING = [
     "--",
 ]
 """What stands for a missing value."""
+MOST_VALUES = 200_000_000
+"""Numbers of a table: 1.6 GB, five hours of 100 columns at 100 Hz. A Parquet file tells before it is read."""
 MOST_RAGGED = 0.02
 """Share of lines with too few or too many values above which a file is no table."""
 
@@ -121,7 +125,6 @@ def unknown_columns(table: Table) -> dict[str, np.ndarray]:
 
 
 def _read_csv(path: Path) -> Table:
-    from pyarrow import ArrowException
     from pyarrow import csv as arrow_csv
 
     text = read_csv_text(path)
@@ -131,7 +134,7 @@ def _read_csv(path: Path) -> Table:
         ragged.append(row.number - 2 + text.first_line if row.number is not None else 0)
         return "skip"
 
-    try:
+    with unreadable(path, "the flight", "correct that line", "not a table of comma-separated values"):
         arrow = arrow_csv.read_csv(
             io.BytesIO(text.content),
             read_options=arrow_csv.ReadOptions(use_threads=False),  # rows are only numbered in one thread
@@ -140,10 +143,6 @@ def _read_csv(path: Path) -> Table:
                 null_values=NOTHING, strings_can_be_null=True, decimal_point=text.decimal
             ),
         )
-    except (ArrowException, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: not a table of comma-separated values: {error}; correct that line"
-        ) from None
     notes = list(text.notes)
     if ragged:
         if len(ragged) > MOST_RAGGED * len(arrow):
@@ -154,26 +153,30 @@ def _read_csv(path: Path) -> Table:
         lines = "line" if len(ragged) == 1 else "lines"
         notes.append(f"{len(ragged)} {lines} without all values left out, the first is line {ragged[0]}")
     names = [name.strip().lstrip("#").strip() for name in arrow.column_names]
-    for name in names:
-        if name and names.count(name) > 1:
-            raise InputError(f"{path}: two columns are named '{name}'; rename or remove one")
+    for name, count in Counter(names).items():
+        if name and count > 1:
+            raise InputError(f"{path}: two columns are named {shown(name)}; rename or remove one")
     return Table(
         str(path), _numbers(str(path), arrow, text.first_line), tuple(notes), text.first_line, tuple(ragged)
     )
 
 
 def _read_parquet(path: Path) -> Table:
-    from pyarrow import ArrowException
     from pyarrow import parquet as arrow_parquet
 
-    try:
+    with unreadable(path, "the flight", "export it again", "not a whole Parquet file"):
+        about = arrow_parquet.read_metadata(path)
+        values = sum(
+            max(0, about.row_group(i).column(k).num_values)
+            for i in range(about.num_row_groups)
+            for k in range(about.num_columns)
+        )
+        if max(values, about.num_rows * about.num_columns) > MOST_VALUES or about.num_rows < 0:
+            raise InputError(
+                f"{path}: claims {about.num_rows} rows of {about.num_columns} columns; export it again"
+            )
         arrow = arrow_parquet.read_table(path)
-    except OSError as error:
-        reason = error.strerror or "not a whole Parquet file"
-        raise InputError(f"{path}: cannot read the flight ({reason}); check path and file") from None
-    except ArrowException as error:
-        raise InputError(f"{path}: not a whole Parquet file ({error}); export it again") from None
-    return Table(str(path), _numbers(str(path), arrow, None), (), None)
+        return Table(str(path), _numbers(str(path), arrow, None), (), None)
 
 
 def _numbers(origin: str, arrow: object, first_line: int | None) -> dict[str, np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from models.errors import InputError
 from models.flight import COLUMNS, Flight
 from models.record import vehicle_to_toml
+from models.whole_file import whole_file, write_whole
 
 DIGITS = 9
 
@@ -29,27 +29,14 @@ def write_flight(flight: Flight, path: Path) -> Path:
         raise InputError(f"{path}: flights are written as .csv or .parquet; change the ending of -o")
     columns = own_table(flight)
     vehicle_path = path.with_suffix(".vehicle.toml")
-    partial, vehicle_partial = (
-        path.with_name(f".{path.name}.part"),
-        path.with_name(f".{vehicle_path.name}.part"),
-    )
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        table = pa.table({name: pa.array(values) for name, values in columns.items()})
+    table = pa.table({name: pa.array(values) for name, values in columns.items()})
+    with whole_file(path, "the flight", "choose another -o") as partial:
         if suffix == ".csv":
             arrow_csv.write_csv(table, partial, arrow_csv.WriteOptions(quoting_style="none"))
         else:
             arrow_parquet.write_table(table, partial, compression="zstd")
-        vehicle_partial.write_text(vehicle_to_toml(flight.vehicle), encoding="utf-8")
-        os.replace(vehicle_partial, vehicle_path)
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot write the flight ({error.strerror or error}); choose another -o"
-        ) from None
-    finally:
-        partial.unlink(missing_ok=True)
-        vehicle_partial.unlink(missing_ok=True)
+        # Before the flight has its name: a flight beside another's vehicle would be read with it.
+        write_whole(vehicle_path, vehicle_to_toml(flight.vehicle), "the vehicle file", "choose another -o")
     return vehicle_path
 
 

@@ -16,7 +16,7 @@ from groundstation.calibration import NOTHING, OUTCOMES
 from groundstation.report.page import write_report
 from groundstation.report.svg import COLOURS, LIGHT, figure, light_style, style, to_svg
 from groundstation.report.told import Told, environment
-from models.errors import InputError
+from models.whole_file import whole_file
 
 Table = dict[str, Any]
 Colours = Mapping[str, str]
@@ -301,14 +301,12 @@ def write_calibration(folder: Path, table: Table) -> Path:
     page = folder / "report.html"
     write_report(page, render_calibration(table))
     write_report(folder / "calibration.json", json.dumps(table, indent=1, allow_nan=False) + "\n")
-    try:
-        with light_style():
-            for chart in CHARTS:
-                if table[chart.needs]:
-                    made = chart.draw(table, LIGHT)
-                    made.savefig(folder / f"{chart.name}.png", dpi=110, facecolor="white")
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot write the charts ({error.strerror}); choose another --output"
-        ) from None
+    with light_style():
+        for chart in CHARTS:
+            if table[chart.needs]:
+                made = chart.draw(table, LIGHT)
+                with whole_file(
+                    folder / f"{chart.name}.png", "a chart", "choose another --output"
+                ) as partial:
+                    made.savefig(partial, dpi=110, facecolor="white")
     return page

@@ -15,6 +15,7 @@ from groundstation.report.svg import style
 from groundstation.report.told import Told, environment, sentences
 from groundstation.side_by_side import SideBySide
 from models.errors import InputError
+from models.whole_file import write_whole
 
 Table = dict[str, Any]
 Charts = dict[str, Markup | None]
@@ -126,14 +127,4 @@ def _body(html: Any, section: Section, drawn: Charts, told: Told) -> Markup:
 
 def write_report(path: Path, text: str) -> None:
     """Write a page whole or not at all. Raises `InputError` where it cannot be written."""
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot write the report ({error.strerror}); choose another --output"
-        ) from None
-    finally:
-        partial.unlink(missing_ok=True)
+    write_whole(path, text, "the report", "choose another --output")

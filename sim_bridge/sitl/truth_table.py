@@ -6,8 +6,8 @@ import csv
 from pathlib import Path
 from types import TracebackType
 
-from models.errors import InputError
 from models.flight import COLUMNS
+from models.whole_file import whole_file
 from sim_bridge.simulator import Simulator
 from sim_bridge.sitl.sensors import specific_force
 
@@ -22,13 +22,8 @@ class TruthTable:
 
     def __init__(self, path: Path, simulator: Simulator) -> None:
         self._simulator = simulator
-        self._path = path
-        try:
-            self._stream = path.open("w", newline="", encoding="utf-8")
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot write the truth ({error.strerror}); choose --truth FILE"
-            ) from None
+        self._whole = whole_file(path, "the truth", "choose --truth FILE")
+        self._stream = self._whole.__enter__().open("w", newline="", encoding="utf-8")
         self._writer = csv.writer(self._stream)
         self._writer.writerow(["t"] + [name for column in _COLUMNS for name in COLUMNS[column][0]])
 
@@ -38,7 +33,8 @@ class TruthTable:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stream.close()
+        self._stream.close()  # however the flight ended, the truth of what was flown stays
+        self._whole.__exit__(None, None, None)
 
     def row(self, time_us: int) -> None:
         """Write the present state."""
