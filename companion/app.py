@@ -63,11 +63,11 @@ class Companion:
         store = ModelStore(Path(settings.models), vehicle, settings.guard.deadline)
         session = open_session(settings.zenoh)
         try:
-            self.link = VehicleLink(settings.connect, settings.timeout)
+            self.link = VehicleLink(settings.connect, settings.timeout, settings.system)
         except InputError:
             session.close()
             raise
-        self.flight = Flight(law, settings.safety, self.emit, settings.trim)
+        self.flight = Flight(law, settings.safety, self.emit, settings.trim, settings.agreement)
         self.director = Director(
             self.link,
             self.flight,
@@ -152,10 +152,13 @@ class Companion:
             self._raise_priority()
         latest = self.link.latest
         outcome = self.flight.tick(odometry, latest)
-        step = outcome.step
-        if step is not None:
-            self.link.send_rates(odometry.vehicle_time_us, step.thrust_command, step.command.body_rate)
         latency = 1e-9 * (time.monotonic_ns() - odometry.host_time_ns)
+        if self.flight.may_leave(outcome, odometry.age + latency):
+            step = outcome.step
+            assert step is not None
+            self.link.send_rates(odometry.vehicle_time_us, step.thrust_command, step.command.body_rate)
+            latency = 1e-9 * (time.monotonic_ns() - odometry.host_time_ns)
+            outcome.age = odometry.age + latency
         self.flight.watch(latest)
         self._vehicle_time_us = odometry.vehicle_time_us
         data = make_tick(odometry, latest, outcome, latency).SerializeToString()

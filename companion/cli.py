@@ -34,6 +34,9 @@ Connect = Annotated[
     typer.Option(help="MAVSDK address of the autopilot, such as udpin://127.0.0.1:14540 or serial://..."),
 ]
 Rate = Annotated[float | None, typer.Option(help="Control rate, Hz: the odometry's.")]
+System = Annotated[
+    int | None, typer.Option(help="MAVLink system id of the autopilot (MAV_SYS_ID), where several are heard.")
+]
 Timeout = Annotated[float | None, typer.Option(help="Seconds to wait for an autopilot.")]
 
 
@@ -47,6 +50,7 @@ def run(
         Path | None, typer.Option(help="Configuration (companion.toml); flags override it.")
     ] = None,
     connect: Connect = None,
+    system: System = None,
     rate: Rate = None,
     timeout: Timeout = None,
     records: Annotated[Path | None, typer.Option(help="Folder of the flight records.")] = None,
@@ -79,13 +83,14 @@ def run(
         "vehicle": vehicle,
         "design": design,
         "connect": connect,
+        "system": system,
         "rate": rate,
         "timeout": timeout,
         "records": records,
         "models": models,
     }
     flags: dict[str, Any] = {
-        name: value if isinstance(value, float) else str(value)
+        name: value if isinstance(value, (int, float)) else str(value)
         for name, value in given.items()
         if value is not None
     }
@@ -129,7 +134,13 @@ def run(
 
 
 @app.command(epilog="Example: companion check --connect udpin://127.0.0.1:14540 --json")
-def check(connect: Connect = None, rate: Rate = None, timeout: Timeout = None, as_json: Json = False) -> None:
+def check(
+    connect: Connect = None,
+    system: System = None,
+    rate: Rate = None,
+    timeout: Timeout = None,
+    as_json: Json = False,
+) -> None:
     """Connect and tell what arrives: rates, mode, battery, and the parameters that matter in trouble."""
     from rich.console import Console
     from rich.markup import escape
@@ -139,7 +150,9 @@ def check(connect: Connect = None, rate: Rate = None, timeout: Timeout = None, a
     from companion.vehicle_link import VehicleLink
 
     defaults = Settings()
-    link = VehicleLink(connect or defaults.connect, timeout if timeout is not None else defaults.timeout)
+    link = VehicleLink(
+        connect or defaults.connect, timeout if timeout is not None else defaults.timeout, system or 0
+    )
     try:
         wanted = rate if rate is not None else defaults.rate
         link.request_rates(wanted)

@@ -42,6 +42,7 @@ _STALLED, _GONE = (
     10.0,
 )  # s without a tick that are told, and without any sign of the vehicle that end a flight
 _ORDER_TIMEOUT = 0.2  # s for the next tick
+_LEAST_MODE_RATE = 4.0  # Hz: two messages within the time after which nothing is sent without any
 _SHADOW_SECONDS = (0.5, 600.0)
 _MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
 
@@ -221,7 +222,9 @@ class Director:
             return self.pose.why_not
         if self.lost_position:
             return self.lost_position
-        return self.rates_too_low(self.rates)
+        if self.flight.agrees.standing:
+            return self.flight.agrees.standing
+        return self.link.ambiguous or self.rates_too_low(self.rates)
 
     @property
     def lost_position(self) -> str:
@@ -240,6 +243,9 @@ class Director:
             return f"odometry had a gap of {rates.longest_gap:.2f} s; the link or this machine is too busy"
         if rates.imu < 0.5 * min(self.rate, 100.0):
             return link_too_slow(f"HIGHRES_IMU at {rates.imu:.0f} Hz")
+        if rates.mode < _LEAST_MODE_RATE:
+            what = f"the flight mode (HEARTBEAT, CURRENT_MODE) at {rates.mode:.1f} Hz, so that a pilot is heard late,"
+            return link_too_slow(what)
         return ""
 
     def _command(self, command: str) -> dict[str, Any]:
@@ -476,11 +482,22 @@ class Director:
                 grounded = math.inf
             if flight.ticked != ticked:
                 ticked, ticked_at, told = flight.ticked, now, False
-            elif now - ticked_at > _STALLED and not told:
-                told = True
-                self.emit("error", "no_odometry", "no odometry, or the control thread hangs: nothing is sent")
+            elif now - ticked_at > _STALLED:
+                if not told:
+                    told = True
+                    text = "no new odometry, or the control thread hangs: nothing is sent"
+                    self.emit("error", "no_odometry", text)
+                self._without_odometry()
             if now - max(latest.heartbeat, ticked_at) > _GONE:
                 flight.abandon("the autopilot fell silent in flight")
+
+    def _without_odometry(self) -> None:
+        """No tick will see that somebody else flies by now, or that the vehicle has landed."""
+        flight, latest = self.flight, self.link.latest
+        if not latest.armed:
+            flight.abandon("the odometry stayed away until the vehicle was disarmed")
+        elif latest.flight_mode != "OFFBOARD":
+            flight.lose(f"the odometry stayed away and {latest.flight_mode} was chosen: silent")
 
     def _wait(self, condition: Callable[[], bool], timeout: float) -> bool:
         end = time.monotonic() + timeout

@@ -124,7 +124,7 @@ def _serial(settings: Settings, root: Path) -> Iterator[Finding]:
 
 def _rates(settings: Settings, root: Path) -> Iterator[Finding]:
     try:
-        link = VehicleLink(settings.connect, settings.timeout)
+        link = VehicleLink(settings.connect, settings.timeout, settings.system)
     except InputError as error:
         advice = "power it; cable: TX to RX; PX4: MAV_1_CONFIG 102 (TELEM2), MAV_1_MODE 2 (Onboard)"
         yield Finding("autopilot", "none", "", f"{error}; {advice}", FAIL)

@@ -17,9 +17,11 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from companion.agreement import Agreement, AgreementLimits
 from companion.control import IDLE_STEP, Attitude, ControlLaw, ControlStep, State, euler, features
 from companion.controllers import Controller, TrimLimits, make_controller
 from companion.guard import Guard
+from companion.resets import Reset, found_reset
 from companion.shadow import Shadow, error_acceleration
 from companion.vehicle_link import Latest, Odometry
 from companion.watch import Watch
@@ -37,6 +39,8 @@ _TUMBLED = 1.4
 """rad of tilt, twice what the cascade may ask for: a vehicle there for longer than `_TUMBLING` s has crashed, or
 nothing that a linear design sends can bring it back."""
 _TUMBLING = 0.5
+_MODE_UNKNOWN = 0.5
+"""s of the vehicle's clock without a word of mode and arming after which nothing is sent until they are told again."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +49,12 @@ class Safety:
 
     The fence is a cylinder around home: `fence_radius`, `fence_height` in m. `takeoff_voltage` and
     `land_voltage` are shares of the nominal voltage; the latter ends a flight when it lasts
-    `battery_patience` s. `odometry_gap` s of the vehicle's clock without odometry end a flight, as do a jump
-    of the position by `jump` m between two messages, a distance of `lost` m from the reference and an estimator that
-    knows its horizontal position to no better than `position_accuracy` m.
+    `battery_patience` s. `odometry_gap` s of the vehicle's clock without odometry end a flight, as do a position that
+    moves `jump` m otherwise than its velocity between two messages, a distance of `lost` m from the reference and an
+    estimator that knows its horizontal position to no better than `position_accuracy` m. Where the estimator tells of a
+    reset, up to `reset` m and `reset_turn` rad of heading are taken for a better view of the same place, and the flight
+    goes on from there. A flight lands when for `late_patience` s setpoints answer to odometry older than `late` s; no
+    setpoint leaves that answers to odometry older than `stale` s: the flight falls silent then.
     `climb_speed` and `transfer_speed` in m/s.
     """
 
@@ -57,7 +64,12 @@ class Safety:
     land_voltage: float = 0.80
     battery_patience: float = 2.0
     odometry_gap: float = 0.25
-    jump: float = 1.0
+    jump: float = 0.3
+    reset: float = 1.0
+    reset_turn: float = 0.35
+    late: float = 0.1
+    late_patience: float = 0.3
+    stale: float = 0.5
     lost: float = 4.0
     position_accuracy: float = 2.0
     climb_speed: float = 0.8
@@ -129,7 +141,8 @@ class Outcome:
     """What one tick decided: `step` and `reference` are None where nothing is sent.
 
     `model` is the live one's hash, whether it acts or not; `shadow` that of the model in the shadow, and
-    `shadow_raw` what it returned (m/s², heading frame).
+    `shadow_raw` what it returned (m/s², heading frame). `age` in s: from the moment of the odometry, by the vehicle's
+    clock, to the answer.
     """
 
     phase: str
@@ -144,6 +157,7 @@ class Outcome:
     trajectory: str = ""
     shadow: str = ""
     shadow_raw: Vector = (0.0, 0.0, 0.0)
+    age: float = 0.0
 
 
 @dataclass
@@ -160,6 +174,7 @@ class Flight:
     safety: Safety
     on_event: Callable[[str, str, str], None] = lambda level, kind, text: None
     trim: TrimLimits = field(default_factory=TrimLimits)
+    agreement: AgreementLimits = field(default_factory=AgreementLimits)
     phase: str = IDLE
     wants_land: bool = False
     sent: int = 0
@@ -178,13 +193,21 @@ class Flight:
     _previous: Odometry | None = None
     _low_since: float = math.inf
     _tumbled_since: float = math.inf
+    _late_since: float = math.inf
+    agrees: Agreement = field(init=False)
+    _reset: Reset | None = None
+    _turned: float = 0.0
+    """rad by which resets have turned the heading since takeoff, and with it the reference's."""
     _yaw: float = 0.0
     _sending: bool = False
-    _unwatched: tuple[Odometry, Odometry | None, Outcome] | None = None
+    _unwatched: tuple[Odometry, Outcome] | None = None
     _guarded: str = ""
     _controller: Controller | None = None
     _thrust: float = 0.0
     _here: Waypoint = (0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        self.agrees = Agreement(self.agreement)
 
     # Orders
 
@@ -198,7 +221,8 @@ class Flight:
                 self._controller = make_controller(mission.controller, self.law, mission.guard, self.trim)
                 self._legs.clear()
                 self._leg, self.wants_land = None, False
-                self._low_since = self._tumbled_since = math.inf
+                self._low_since = self._tumbled_since = self._late_since = math.inf
+                self._turned, self._reset = 0.0, None
 
         self._orders.append(order)
 
@@ -217,6 +241,7 @@ class Flight:
         def order() -> None:
             if self.phase == TAKEOFF and self._leg is None and self.mission is not None:
                 assert self._previous is not None
+                self.agrees.begin()
                 self.home = self._previous.position
                 self._here = (0.0, 0.0, 0.0, self._yaw)
                 self._legs.extend(self._plan(self.mission))
@@ -268,6 +293,11 @@ class Flight:
         """Fall silent, so that the autopilot's own failsafe ends the flight."""
         self._orders.append(lambda: self._silence("gave_up", reason))
 
+    def lose(self, reason: str) -> None:
+        """Fall silent at once in a flight to which no odometry comes any more; the autopilot flies the vehicle."""
+        if self.phase not in (IDLE, SILENT):
+            self._silence("taken_over", reason)
+
     def abandon(self, reason: str) -> None:
         """Forget a flight whose vehicle is gone: no odometry will come to end it."""
         self.on_event("error", "abandoned", reason)
@@ -287,22 +317,39 @@ class Flight:
 
     def tick(self, odometry: Odometry, latest: Latest) -> Outcome:
         """Decide what to send for this odometry message."""
-        previous = self._previous
         out = self._decide(odometry, latest)
         self._sending = out.step is not None
         self.ticked += 1
-        self._unwatched = (odometry, previous, out)
+        self._unwatched = (odometry, out)
         self.sent += self._sending
         return out
+
+    def may_leave(self, out: Outcome, age: float) -> bool:
+        """Whether the setpoint of the last `tick` may be sent when its odometry is `age` s old by now.
+
+        A process that was stopped, or had no processor, in the middle of a tick wakes up with a setpoint for a vehicle
+        that has long been elsewhere, or that somebody else flies.
+        """
+        out.age = age
+        if out.step is None:
+            return False
+        if age > self.safety.stale:
+            self._stale(age)
+            out.step, out.phase, self._sending = None, self.phase, False
+            self.sent -= 1
+        return out.step is not None
 
     def watch(self, latest: Latest) -> None:
         """Look for reasons to end the flight in the odometry of the last `tick`, and at the models.
 
         Called after its setpoint has left, so that it costs no latency; what it finds acts on the next tick.
         """
-        if self._unwatched is not None and self._leg is not None and self.phase not in (IDLE, SILENT):
-            odometry, previous, out = self._unwatched
-            self._watch(odometry, previous, out.interval, out.position, latest)
+        if self._unwatched is None:
+            return
+        odometry, out = self._unwatched
+        self.agrees.step(odometry, latest.imu_sample)
+        if self._leg is not None and self.phase not in (IDLE, SILENT):
+            self._watch(odometry, out, latest)
             self._watch_guard()
             if out.step is not None:
                 self._watch_candidate(odometry, out, latest)
@@ -315,6 +362,8 @@ class Flight:
         self._now = 1e-6 * odometry.vehicle_time_us
         w, x, y, z = odometry.quaternion
         self._yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        if self._leg is not None and previous is not None:
+            self._carry(odometry, previous, interval)
         hx, hy, hz = self.home
         px, py, pz = odometry.position
         position = (px - hx, py - hy, pz - hz)
@@ -334,10 +383,17 @@ class Flight:
         if mission.guard is not None:
             out.model = mission.guard.live
         if self._leg is None:
-            out.step = IDLE_STEP
+            out.step = IDLE_STEP if odometry.age <= self.safety.stale else None
             return out
         if latest.flight_mode != "OFFBOARD":
             return out  # landing by the autopilot's own mode
+        if odometry.age > self.safety.stale:
+            self._stale(odometry.age)
+            out.phase = self.phase
+            return out
+        told = latest.mode_time_us
+        if told is not None and odometry.vehicle_time_us - told > 1e6 * _MODE_UNKNOWN:
+            return out  # somebody else may fly by now
         out.reference = self._reference(position, odometry)
         out.phase = self.phase
         guard = mission.guard
@@ -395,14 +451,28 @@ class Flight:
                 self._next_leg()
                 assert self._leg is not None
                 leg, t = self._leg, self._now - self._leg_begin
-        reference = leg.trajectory.at(t)
+        reference = self._shown(leg.trajectory.at(t))
         self._here = (*reference.position, reference.yaw)
         return reference
+
+    def _shown(self, reference: ReferenceSample) -> ReferenceSample:
+        """The reference in the heading that the estimator has now."""
+        return reference._replace(yaw=reference.yaw + self._turned) if self._turned else reference
+
+    def _carry(self, odometry: Odometry, previous: Odometry, interval: float) -> None:
+        """Where the estimate has jumped, the vehicle has not: home and the reference's heading go with it."""
+        reset = found_reset(odometry, previous, interval, self.safety.jump, self.safety.reset_turn)
+        if reset is None:
+            return
+        (hx, hy, hz), (dx, dy, dz) = self.home, reset.moved
+        self.home = hx + dx, hy + dy, hz + dz
+        self._turned += reset.turned
+        self._reset = reset
 
     def _preview(self, ahead: float) -> ReferenceSample:
         """The reference of this leg `ahead` s from now; it holds still after the leg's end."""
         assert self._leg is not None
-        return self._leg.trajectory.at(self._now - self._leg_begin + ahead)
+        return self._shown(self._leg.trajectory.at(self._now - self._leg_begin + ahead))
 
     def _next_leg(self) -> None:
         if not self._legs:
@@ -450,10 +520,8 @@ class Flight:
                 text = f"{latest.flight_mode} was chosen by {who}: silent"
                 self._silence("pilot_takeover", text)
 
-    def _watch(
-        self, odometry: Odometry, previous: Odometry | None, interval: float, position: Vector, latest: Latest
-    ) -> None:
-        safety = self.safety
+    def _watch(self, odometry: Odometry, out: Outcome, latest: Latest) -> None:
+        safety, interval, position, age = self.safety, out.interval, out.position, out.age
         if latest.flight_mode != "OFFBOARD":
             return
         _, x, y, _ = odometry.quaternion
@@ -462,14 +530,29 @@ class Flight:
         if self._now - self._tumbled_since > _TUMBLING:
             self._silence("tumbled", f"tilted by more than {math.degrees(_TUMBLED):.0f} degrees: silent")
             return
+        reset, self._reset = self._reset, None
         if self.wants_land:
             return
-        if interval > safety.odometry_gap or interval < 0.0:
-            what = f"missing for {interval:.2f} s" if interval > 0.0 else "going back in time"
+        gap = interval / (1 + odometry.overtaken)  # those overtaken have arrived
+        if gap > safety.odometry_gap or interval < 0.0:
+            what = f"missing for {gap:.2f} s" if interval > 0.0 else "going back in time"
             self._land(f"odometry was {what}", return_home=False, kind="odometry_gap")
             return
-        if previous is not None and math.dist(odometry.position, previous.position) > safety.jump:
-            self._land("the estimated position jumped", return_home=False, kind="position_jump")
+        if interval > safety.odometry_gap:
+            text = (
+                f"this machine stood still for {interval:.2f} s; {odometry.overtaken} messages were overtaken"
+            )
+            self.on_event("warning", "stalled", text)
+        if reset is not None and self._watch_reset(reset):
+            return
+        if self.agrees.reason:
+            self._land(self.agrees.reason, return_home=False, kind="odometry_disagrees")
+            return
+        late = max(odometry.age, age) > safety.late
+        self._late_since = min(self._late_since, self._now) if late else math.inf
+        if self._now - self._late_since > safety.late_patience:
+            text = f"setpoints answer to odometry that is {age:.2f} s old; {safety.late:g} s are allowed"
+            self._land(text, return_home=False, kind="late")
             return
         if math.hypot(position[0], position[1]) > safety.fence_radius or position[2] > safety.fence_height:
             self._land("outside the geofence", return_home=False, kind="geofence")
@@ -481,6 +564,20 @@ class Flight:
         self._low_since = min(self._low_since, self._now) if low else math.inf
         if self._now - self._low_since > safety.battery_patience and self.phase != LANDING:
             self._land(f"battery at {latest.battery_voltage:.1f} V", return_home=True, kind="battery_low")
+
+    def _watch_reset(self, reset: Reset) -> bool:
+        """Tell of a reset of the estimate; whether the flight lands for it. Home has been carried over already."""
+        safety = self.safety
+        if not reset.told:
+            kind = "position_jump" if reset.distance > safety.jump else "heading_jump"
+            self._land(f"{reset.text}, and the estimator told of no reset", return_home=False, kind=kind)
+            return True
+        if reset.distance > safety.reset or abs(reset.turned) > safety.reset_turn:
+            self._land(f"the estimator was reset: {reset.text}", return_home=False, kind="estimator_reset")
+            return True
+        text = f"the estimator was reset: {reset.text}; home and reference are carried over"
+        self.on_event("warning", "estimator_reset", text)
+        return False
 
     def _watch_guard(self) -> None:
         """Tell where the guard went back to the last good model by itself."""
@@ -550,6 +647,11 @@ class Flight:
             stay = self._here
             self._leg, self._leg_begin = Leg(LANDING, transfer(stay, stay, 1.0, 1.0), name="stay"), self._now
             self.phase, self.wants_land = LANDING, True
+
+    def _stale(self, age: float) -> None:
+        """Nothing may leave any more: what is known of the vehicle is too old, and with it who flies it."""
+        text = f"the odometry to answer to is {age:.2f} s old, {self.safety.stale:g} s are allowed: silent"
+        self._silence("stale", text)
 
     def _silence(self, kind: str, text: str) -> None:
         self.phase, self.wants_land = SILENT, False

@@ -78,7 +78,7 @@ def preflight_command(
 
     settings = _settings(config, vehicle, connect, rate, timeout, records)
     believed = load_vehicle(settings.vehicle) if settings.vehicle else None
-    link = VehicleLink(settings.connect, settings.timeout)
+    link = VehicleLink(settings.connect, settings.timeout, settings.system)
     changed: list[str] = []
     try:
         with _progress(as_json) as tell, _poses(settings, believed, link) as pose:

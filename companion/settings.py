@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from companion.agreement import AgreementLimits
 from companion.control import Limits
 from companion.controllers import TrimLimits
 from companion.flight import Safety
@@ -25,12 +26,14 @@ class Settings:
     """Everything `companion run` needs; the sections are the settings of the parts.
 
     `design` empty means `design.json` beside the vehicle file. `rate` in Hz, `timeout` in s to wait for an
-    autopilot. `realtime` is the priority (SCHED_FIFO) that the control thread asks for, 0 for none.
+    autopilot, `system` its MAVLink system id, 0 for the first that is heard. `realtime` is the priority (SCHED_FIFO)
+    that the control thread asks for, 0 for none.
     """
 
     vehicle: str = ""
     design: str = ""
     connect: str = "udpin://127.0.0.1:14540"
+    system: int = field(default=0, metadata={"zero": True})
     timeout: float = 10.0
     rate: float = 100.0
     records: str = "records"
@@ -41,6 +44,7 @@ class Settings:
     guard: GuardLimits = field(default_factory=GuardLimits)
     shadow: ShadowLimits = field(default_factory=ShadowLimits)
     trim: TrimLimits = field(default_factory=TrimLimits)
+    agreement: AgreementLimits = field(default_factory=AgreementLimits)
     pose: PoseSettings = field(default_factory=PoseSettings)
     realtime: int = field(default=0, metadata={"zero": True})
 
@@ -48,6 +52,10 @@ class Settings:
         """The same, or `InputError` for a value without sense."""
         if not 10.0 <= self.rate <= 1000.0:
             raise InputError(f"rate = {self.rate:g} is outside 10 to 1000 Hz")
+        if not 0 <= self.system <= 255:
+            raise InputError(
+                f"system = {self.system} is outside 1 to 255 (0: the first autopilot that is heard)"
+            )
         if not 0.1 <= self.timeout <= 600.0:
             raise InputError(f"timeout = {self.timeout:g} is outside 0.1 to 600 s")
         if not 0 <= self.realtime <= 80:

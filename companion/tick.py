@@ -25,6 +25,8 @@ def make_tick(odometry: Odometry, latest: Latest, outcome: Outcome, latency: flo
         trajectory=outcome.trajectory,
         interval=outcome.interval,
         latency=latency,
+        age=outcome.age,
+        overtaken=odometry.overtaken,
         inference=outcome.inference,
         setpoint_sent=outcome.step is not None,
         shadow=outcome.shadow,

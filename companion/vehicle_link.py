@@ -35,7 +35,9 @@ from mavsdk.plugins.mocap.mocap import (
     VisionPositionEstimate,
 )
 from mavsdk.plugins.param.param import Param, ParamError, ParamResult
+from mavsdk.system import System
 
+from companion.arrival import Arrivals
 from companion.estimator import EstimatorStatus, estimator_status
 from companion.px4_events import ArmingChecks, ArmingReport, Px4Event, describe, unhealthy
 from models import frames
@@ -48,6 +50,7 @@ _ROOT_HALF = math.sqrt(0.5)
 _FRAMES_WORLD_NED = (1,)  # MAV_FRAME_LOCAL_NED: what PX4 says of its odometry's velocity
 _FRAMES_BODY_FRD = (8, 12)  # MAV_FRAME_BODY_NED (deprecated name) and MAV_FRAME_BODY_FRD
 
+_COUNTED = ("ODOMETRY", "HIGHRES_IMU", "BATTERY_STATUS", "ESC_STATUS", "MODE")
 _MESSAGE_IDS = {
     "ODOMETRY": 331,
     "HIGHRES_IMU": 105,
@@ -96,14 +99,18 @@ _MODES = {
 _MODE_NUMBERS = {"OFFBOARD": (6, 0), "LAND": (4, 6), "HOLD": (4, 3)}
 _LANDED = {0: "unknown", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
 _RECENT = 2.0  # s
+_MODE_RATE = 50.0  # Hz: a pilot who takes over is heard within 0.02 s instead of 1 s
 _TIMESYNC_RATE = 50.0  # Hz; PX4 wants 500 answers
 _RPM = 2.0 * math.pi / 60.0
 _AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 
 
 class Odometry(NamedTuple):
-    """One odometry message, ENU and FLU, SI; `vehicle_time_us` is the vehicle's clock, `host_time_ns`
-    ours."""
+    """One odometry message, ENU and FLU, SI; `vehicle_time_us` is the vehicle's clock, `host_time_ns` ours.
+
+    `age` s passed by the vehicle's clock from the stamp to `host_time_ns`; `overtaken` samples before this one were not
+    looked at, because newer ones were waiting.
+    """
 
     vehicle_time_us: int
     host_time_ns: int
@@ -112,14 +119,26 @@ class Odometry(NamedTuple):
     quaternion: tuple[float, float, float, float]
     angular_velocity: Vector
     reset_counter: int
+    age: float = 0.0
+    overtaken: int = 0
+
+
+class ImuSample(NamedTuple):
+    """One HIGHRES_IMU message: the vehicle's clock in us, m/s² and rad/s in FLU."""
+
+    time_us: int
+    specific_force: Vector
+    gyro: Vector
 
 
 @dataclass
 class Latest:
     """The last of everything that arrives beside the odometry; written by MAVSDK's thread, read by any.
 
-    `battery_voltage` V (0 unknown), `rotor_speed` rad/s (empty unknown). `imu` is HIGHRES_IMU as it came, not
-    yet read: it arrives just before the odometry, and what it takes to read it would delay the setpoint.
+    `battery_voltage` V (0 unknown) is that of the battery with the lowest number, `batteries` has all of them.
+    `rotor_speed` rad/s (empty unknown). `imu` is HIGHRES_IMU as it came, not yet read: it arrives just before the
+    odometry, and what it takes to read it would delay the setpoint. `mode_time_us` is when mode and arming were told
+    last, by the vehicle's clock: the stamp of the odometry that came before it, however late either was read.
     `killed` while the motors are cut (kill switch, termination), `failsafe` where the mode is one that the
     autopilot's failsafe chose, `unhealthy` what SYS_STATUS says is not well, `notices` what it told of failsafes,
     switches and failed checks (monotonic s, text). `estimator` is what the estimator says of itself, None before it
@@ -127,8 +146,10 @@ class Latest:
     """
 
     battery_voltage: float = 0.0
+    batteries: dict[int, float] = field(default_factory=dict)
     rotor_speed: tuple[float, ...] = ()
     flight_mode: str = "UNKNOWN"
+    mode_time_us: int | None = None
     armed: bool = False
     landed: str = "unknown"
     heartbeat: float = -math.inf
@@ -139,6 +160,7 @@ class Latest:
     unhealthy: tuple[str, ...] = ()
     estimator: EstimatorStatus | None = None
     notices: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=4))
+    _read: tuple[str, ImuSample | None] = ("", None)
 
     @property
     def why(self) -> str:
@@ -147,24 +169,28 @@ class Latest:
         return "; ".join(text for told, text in tuple(self.notices) if now - told < _RECENT)
 
     @property
+    def imu_sample(self) -> ImuSample | None:
+        """What HIGHRES_IMU said last; None before the first message and for one with a number missing. Read once."""
+        text, sample = self._read
+        if text is not self.imu:
+            text = self.imu
+            sample = imu_from_wire(text)
+            self._read = text, sample
+        return sample
+
+    @property
     def specific_force(self) -> Vector | None:
-        """Specific force of the accelerometer, m/s² FLU; None before the first message and for one that is no
-        number.
-        """
-        try:
-            fields = json.loads(self.imu)
-            x, y, z = fields["xacc"], -fields["yacc"], -fields["zacc"]
-        except (KeyError, TypeError, ValueError):
-            return None
-        return (x, y, z)
+        """Specific force of the accelerometer, m/s² FLU; None where `imu_sample` is None."""
+        sample = self.imu_sample
+        return sample.specific_force if sample is not None else None
 
 
 @dataclass(frozen=True)
 class Rates:
     """What arrives: messages a second of the vehicle's clock (odometry), and of ours (the others).
 
-    `longest_gap` in s of the vehicle's clock between two odometry messages, `duration` of the measurement in
-    s.
+    `mode` counts both messages that tell the flight mode. `longest_gap` in s of the vehicle's clock between two
+    odometry messages, `duration` of the measurement in s.
     """
 
     odometry: float
@@ -173,18 +199,22 @@ class Rates:
     esc: float
     longest_gap: float
     duration: float
+    mode: float = math.inf
 
 
 class VehicleLink:
     """A connection to one autopilot.
 
     Raises `InputError` where the address cannot be used or nobody answers within `timeout` s. `on_odometry`
-    is called with each odometry message on the control thread; what it raises ends up in `on_error` and sends
-    nothing; `on_blind` takes its place for a message without an estimate. `on_notice` gets what the autopilot
-    tells of failsafes, switches and failed checks, in plain words.
+    is called with each odometry message on the control thread, but for those that are repeated, or overtaken by newer
+    ones; what it raises ends up in `on_error` and sends nothing; `on_blind` takes its place for a message without an
+    estimate. `system` is the MAVLink system that is flown, 0 the first autopilot that is heard. `on_notice` gets what
+    the autopilot tells of failsafes, switches and failed checks, in plain words.
     """
 
-    def __init__(self, address: str = "udpin://127.0.0.1:14540", timeout: float = 10.0) -> None:
+    def __init__(
+        self, address: str = "udpin://127.0.0.1:14540", timeout: float = 10.0, system: int = 0
+    ) -> None:
         self.address = address
         self.latest = Latest()
         self.on_odometry: Callable[[Odometry], None] = lambda odometry: None
@@ -193,7 +223,9 @@ class VehicleLink:
         self.on_error: Callable[[str], None] = lambda text: None
         self.on_notice: Callable[[str], None] = lambda text: None
         self.malformed = 0
-        self._counts = dict.fromkeys(("ODOMETRY", "HIGHRES_IMU", "BATTERY_STATUS", "ESC_STATUS"), 0)
+        self.arrivals = Arrivals()
+        self._overtaken = 0
+        self._counts = dict.fromkeys(_COUNTED, 0)
         self._times: deque[int] = deque(maxlen=4096)
         self._escs: dict[int, float] = {}
         self._param_lock = threading.Lock()
@@ -201,6 +233,7 @@ class VehicleLink:
         self._event_sequence = -1
         self._text_number = -1
         self._version = ""
+        self._shares_clock = False
         # MAVSDK prints what it does in colour on standard output, which belongs to our caller.
         mavsdk.log_subscribe(lambda level, text, file, line: True)
         # A ground station's heartbeat would turn STATUSTEXT on, but PX4 then counts us as its data link.
@@ -215,17 +248,12 @@ class VehicleLink:
                 f"cannot open {address} ({reason}): is another program using the port, or the address "
                 "misspelt?"
             )
-        system = self._mavsdk.first_autopilot(timeout)
-        if system is None:
-            self._mavsdk.destroy()
-            raise InputError(
-                f"no autopilot answering on {address} within {timeout:g} s; start it, or pass its address "
-                "with --connect"
-            )
-        self._system = system.get_system_id()
-        self._param = Param(system)
-        self._mocap = Mocap(system)
-        self._direct = MavlinkDirect(system)
+        autopilot = self._autopilot(timeout, system)
+        self._system = autopilot.get_system_id()
+        self._chosen = bool(system)
+        self._param = Param(autopilot)
+        self._mocap = Mocap(autopilot)
+        self._direct = MavlinkDirect(autopilot)
         for name, handler in (
             ("ODOMETRY", self._odometry),
             ("BATTERY_STATUS", self._battery),
@@ -238,6 +266,7 @@ class VehicleLink:
             ("SYS_STATUS", self._system_status),
             ("ESTIMATOR_STATUS", self._estimator),
             ("AUTOPILOT_VERSION", self._autopilot_version),
+            ("TIMESYNC", self._timesync),
         ):
             self._direct.subscribe_message(name, self._safe(handler))
         self._direct.subscribe_message("HIGHRES_IMU", self._imu)
@@ -246,6 +275,39 @@ class VehicleLink:
         """Disconnect."""
         self._direct.destroy()
         self._mavsdk.destroy()
+
+    def _autopilot(self, timeout: float, number: int) -> System:
+        """The autopilot to fly; raises `InputError` where it does not answer."""
+        found = self._mavsdk.first_autopilot(timeout)
+        end = time.monotonic() + timeout
+        while found is not None and number and found.get_system_id() != number:
+            heard = {one.get_system_id(): one for one in self._mavsdk.get_systems() if one.has_autopilot()}
+            found = heard.get(number, found if time.monotonic() < end else None)
+            time.sleep(0.05)
+        if found is None:
+            heard_ids = sorted(one.get_system_id() for one in self._mavsdk.get_systems())
+            self._mavsdk.destroy()
+            which = f"no autopilot with system id {number}" if number else "no autopilot"
+            others = f"; heard there: {', '.join(map(str, heard_ids))}" if heard_ids else ""
+            raise InputError(
+                f"{which} answering on {self.address} within {timeout:g} s{others}; start it, or pass its address "
+                f"with --connect{' and its MAV_SYS_ID with --system' if number else ''}"
+            )
+        return found
+
+    @property
+    def ambiguous(self) -> str:
+        """'' where it is certain which autopilot is flown: it is the only one on this link, or was chosen."""
+        if self._chosen or self._mavsdk.system_count() < 2:
+            return ""
+        speaking = [one for one in self._mavsdk.get_systems() if one.has_autopilot() and one.is_connected()]
+        heard = sorted(one.get_system_id() for one in speaking)
+        if len(heard) < 2:
+            return ""
+        return (
+            f"{len(heard)} autopilots speak on {self.address} (systems {', '.join(map(str, heard))}): say which one "
+            "is flown with --system, or give each a link of its own"
+        )
 
     # What goes out
 
@@ -272,7 +334,7 @@ class VehicleLink:
         MAVSDK leaves them unanswered, and PX4 then takes a pose for one of the moment of its arrival. It believes
         the answers after 500 of them.
         """
-        self._direct.subscribe_message("TIMESYNC", self._safe(self._timesync))
+        self._shares_clock = True
         self.command(_SET_MESSAGE_INTERVAL, float(_MESSAGE_IDS["TIMESYNC"]), 1e6 / _TIMESYNC_RATE)
 
     def send_pose(self, pose: Pose, taken_us: int, reset_counter: int) -> None:
@@ -311,9 +373,9 @@ class VehicleLink:
             "BATTERY_STATUS": 10.0,
             "ESC_STATUS": min(rate, 100.0),
             "EXTENDED_SYS_STATE": 5.0,
-            "CURRENT_MODE": 10.0,
+            "CURRENT_MODE": _MODE_RATE,  # PX4 from 1.15 on
             "ESTIMATOR_STATUS": 5.0,
-            "HEARTBEAT": 10.0,  # a pilot who takes over is heard within 0.1 s instead of 1 s
+            "HEARTBEAT": _MODE_RATE,
         }
         for name, wish in wishes.items():
             self.command(_SET_MESSAGE_INTERVAL, float(_MESSAGE_IDS[name]), 1e6 / wish)
@@ -419,15 +481,17 @@ class VehicleLink:
             esc=count["ESC_STATUS"],
             longest_gap=max(gaps, default=math.inf),
             duration=elapsed,
+            mode=count["MODE"],
         )
 
     def _safe(self, handler: Callable[[dict[str, Any]], None]) -> Callable[[MavlinkMessage, Any], None]:
         def callback(message: MavlinkMessage, _: Any) -> None:
             arrived = time.monotonic_ns()
+            if not self._is_autopilot(message):
+                return
             try:
                 fields = json.loads(without_covariance(message.fields_json))
                 fields["arrived"] = arrived
-                fields["component"] = message.component_id
                 handler(fields)
             except (KeyError, TypeError, ValueError, IndexError) as error:
                 self.malformed += 1
@@ -435,23 +499,54 @@ class VehicleLink:
 
         return callback
 
+    def _is_autopilot(self, message: MavlinkMessage) -> bool:
+        """Cameras, gimbals, smart batteries and other vehicles may speak on the same link: none of them decides."""
+        return message.component_id == _AUTOPILOT and message.system_id == self._system
+
     def _odometry(self, fields: dict[str, Any]) -> None:
-        self._counts["ODOMETRY"] += 1
-        self._times.append(int(fields["time_usec"]))
-        odometry = odometry_from_wire(fields)
+        stamp = int(fields["time_usec"])
+        arrival = self.arrivals.judge(stamp, fields["arrived"])
+        if arrival.newer:
+            self._counts["ODOMETRY"] += 1
+            self._times.append(stamp)
+        if arrival.overtaken:
+            self._overtaken += 1
+            return
+        odometry = odometry_from_wire(fields, arrival.age, self._overtaken) if arrival.newer else None
         if odometry is not None:
+            self._overtaken = 0
             self.on_odometry(odometry)
         else:
             self.on_blind()
+        now = time.monotonic_ns()
+        self.arrivals.done(now)
+        if self.arrivals.clock.due(now):
+            self._ask_time(now)
+
+    def _ask_time(self, now_ns: int) -> None:
+        self._send_timesync(f'{{"tc1":0,"ts1":{now_ns},"target_system":{self._system},"target_component":1}}')
+
+    def _send_timesync(self, fields: str) -> None:
+        self._direct.send_message(
+            MavlinkMessage(
+                "TIMESYNC",
+                target_system_id=self._system,
+                target_component_id=_AUTOPILOT,
+                fields_json=fields,
+            )
+        )
 
     def _imu(self, message: MavlinkMessage, _: Any) -> None:
-        self._counts["HIGHRES_IMU"] += 1
-        self.latest.imu = message.fields_json
+        if self._is_autopilot(message):
+            self._counts["HIGHRES_IMU"] += 1
+            self.latest.imu = message.fields_json
 
     def _battery(self, fields: dict[str, Any]) -> None:
         self._counts["BATTERY_STATUS"] += 1
         cells = [mv for mv in fields["voltages"] + fields.get("voltages_ext", []) if mv not in (0, 0xFFFF)]
-        self.latest.battery_voltage = 1e-3 * sum(cells)
+        batteries = self.latest.batteries
+        batteries[int(fields["id"])] = 1e-3 * sum(cells)
+        self.latest.battery_voltage = batteries[min(batteries)]
 
     def _esc(self, fields: dict[str, Any]) -> None:
         self._counts["ESC_STATUS"] += 1
@@ -460,9 +555,12 @@ class VehicleLink:
             self._escs[first + i] = abs(rpm) * _RPM
         self.latest.rotor_speed = tuple(self._escs[i] for i in sorted(self._escs))
 
+    def _mode_told(self) -> None:
+        self._counts["MODE"] += 1
+        self.latest.mode_time_us = self.arrivals.last_us
+
     def _heartbeat(self, fields: dict[str, Any]) -> None:
-        if fields["component"] != _AUTOPILOT:
-            return
+        self._mode_told()
         self.latest.heartbeat = 1e-9 * fields["arrived"]
         self.latest.armed = bool(int(fields["base_mode"]) & _ARMED)
         self.latest.killed = int(fields["system_status"]) == _TERMINATED
@@ -471,6 +569,7 @@ class VehicleLink:
         self.on_state()
 
     def _current_mode(self, fields: dict[str, Any]) -> None:
+        self._mode_told()
         # PX4 keeps the mode that somebody chose apart from what its failsafes made of it.
         intended, mode = int(fields["intended_custom_mode"]), int(fields["custom_mode"])
         self.latest.failsafe = intended not in (0, mode)
@@ -489,7 +588,7 @@ class VehicleLink:
         self._text_number = number
 
     def _event(self, fields: dict[str, Any]) -> None:
-        if fields["component"] != _AUTOPILOT or int(fields["sequence"]) == self._event_sequence:
+        if int(fields["sequence"]) == self._event_sequence:
             return
         self._event_sequence = int(fields["sequence"])
         arguments = bytes(int(byte) for byte in fields["arguments"])
@@ -505,18 +604,14 @@ class VehicleLink:
         self._version = f"PX4 {version >> 24 & 0xFF}.{version >> 16 & 0xFF}.{version >> 8 & 0xFF}"
 
     def _timesync(self, fields: dict[str, Any]) -> None:
-        if fields["component"] != _AUTOPILOT or int(fields["tc1"]):
-            return
-        ours = time.time_ns() - (time.monotonic_ns() - fields["arrived"])
-        answer = f'{{"tc1":{ours},"ts1":{fields["ts1"]},"target_system":{self._system},"target_component":1}}'
-        self._direct.send_message(
-            MavlinkMessage(
-                "TIMESYNC",
-                target_system_id=self._system,
-                target_component_id=_AUTOPILOT,
-                fields_json=answer,
+        theirs = int(fields["tc1"])
+        if theirs:
+            self.arrivals.clock.answered(int(fields["ts1"]), theirs)
+        elif self._shares_clock:
+            ours = time.time_ns() - (time.monotonic_ns() - fields["arrived"])
+            self._send_timesync(
+                f'{{"tc1":{ours},"ts1":{fields["ts1"]},"target_system":{self._system},"target_component":1}}'
             )
-        )
 
     def _estimator(self, fields: dict[str, Any]) -> None:
         self.latest.estimator = estimator_status(fields)
@@ -565,7 +660,20 @@ def mode_name(custom_mode: int) -> str:
     return _MODES.get((main, sub), _MODES.get((main, 0), "UNKNOWN"))
 
 
-def odometry_from_wire(fields: dict[str, Any]) -> Odometry | None:
+def imu_from_wire(text: str) -> ImuSample | None:
+    """A HIGHRES_IMU message (JSON as on the wire, FRD) in FLU; None where a number that is needed is not there."""
+    try:
+        fields = json.loads(text)
+        force = fields["xacc"], -fields["yacc"], -fields["zacc"]
+        gyro = fields["xgyro"], -fields["ygyro"], -fields["zgyro"]
+        if not math.isfinite(sum(force) + sum(gyro)):
+            return None
+        return ImuSample(int(fields["time_usec"]), force, gyro)
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def odometry_from_wire(fields: dict[str, Any], age: float = 0.0, overtaken: int = 0) -> Odometry | None:
     """An ODOMETRY message (fields as on the wire, NED and FRD, `arrived` ns) in ENU and FLU.
 
     The velocity is turned according to `child_frame_id`. None where a number that is needed is not there (PX4
@@ -599,4 +707,6 @@ def odometry_from_wire(fields: dict[str, Any]) -> Odometry | None:
         attitude,
         (p, -q, -r),
         int(fields.get("reset_counter", 0)),
+        age,
+        overtaken,
     )

@@ -189,10 +189,10 @@ class FlightRecord:
     `ticks` maps column names to arrays (N,) or (N, k): those of `models.flight.COLUMNS` plus `t` (s of the
     vehicle's clock since the first tick), `vehicle_time` and `host_time` (s), `feedback_thrust` (N),
     `feedback_body_rate` (rad/s), `correction`, `trim`, `correction_raw` (m/s², heading frame), `interval`, `latency`,
-    `inference` (s), `setpoint_sent`, `armed` (bool) and the words `model`, `controller`, `flight_mode`,
-    `phase`, `guard`, `trajectory`, `shadow` (hash of a model evaluated but not applied), with `shadow_raw`
-    (m/s², heading frame) for what that returned. What was never known is absent; what is missing in a tick is
-    NaN.
+    `age`, `inference` (s), `overtaken` (odometry messages), `setpoint_sent`, `armed` (bool) and the words `model`,
+    `controller`, `flight_mode`, `phase`, `guard`, `trajectory`, `shadow` (hash of a model evaluated but not applied),
+    with `shadow_raw` (m/s², heading frame) for what that returned. What was never known is absent; what is missing in a
+    tick is NaN.
     `truncated` tells that the file has no proper end, `notes` what that and any drops mean.
     """
 
@@ -312,6 +312,8 @@ _SCALARS = {
     "yaw_reference": float,
     "interval": float,
     "latency": float,
+    "age": float,
+    "overtaken": int,
     "inference": float,
     "setpoint_sent": bool,
     "armed": bool,

@@ -49,6 +49,7 @@ CURVES: tuple[tuple[str, str, Colour], ...] = (
     ("correction/shadow/y", "in the shadow, y", AXES[1]),
     ("correction/shadow/z", "in the shadow, z", AXES[2]),
     ("latency/setpoint", "odometry to setpoint", NEWEST),
+    ("latency/age", "age of the odometry", REFERENCE),
     ("latency/inference", "model", WARNING),
     ("battery/voltage", "battery", MEASURED),
 )
@@ -207,7 +208,7 @@ def state(vehicle: str, tick: Tick | None, silent: float, models: dict[str, Any]
         f"| guard | {f'**{guard}**' if guard.startswith('tripped') else guard} |",
         f"| battery | {tick.battery_voltage:.1f} V |",
         f"| height | {tick.position.z:.1f} m |",
-        f"| latency | {1e3 * tick.latency:.1f} ms |",
+        f"| latency | {1e3 * tick.latency:.1f} ms, of odometry {1e3 * tick.age:.0f} ms old |",
     ]
     return "\n".join(lines)
 
@@ -267,7 +268,7 @@ def blueprint() -> rrb.Blueprint:
                 curves("rates", "body rates sent (deg/s): roll red, pitch green, yaw blue"),
                 curves("correction", "correction (m/s²): x red, y green, z blue; thin: in the shadow"),
                 rrb.Horizontal(
-                    curves("latency", "latency (ms), model orange"),
+                    curves("latency", "latency (ms), age of the odometry grey, model orange"),
                     curves("battery", "battery (V)"),
                 ),
             ),
@@ -298,6 +299,7 @@ def _columns(ticks: list[Tick]) -> dict[str, np.ndarray]:
     out["thrust/sent"] = np.array([t.thrust_command for t in ticks])
     out["thrust/feedback"] = np.array([t.feedback.thrust for t in ticks])
     out["latency/setpoint"] = 1e3 * np.array([t.latency for t in ticks])
+    out["latency/age"] = 1e3 * np.array([t.age for t in ticks])
     out["latency/inference"] = 1e3 * np.array([t.inference for t in ticks])
     out["battery/voltage"] = np.array([t.battery_voltage or np.nan for t in ticks])
     return out

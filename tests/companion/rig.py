@@ -175,8 +175,15 @@ class Wiretap:
                     continue
 
 
+PATIENT = "[safety]\nlate = 0.5\nstale = 3.0\n"
+"""Settings for tests of other things than lateness: a busy machine is late, and would end their flights."""
+
+
 class Companion(Process):
-    """`companion run` with a folder of its own, and a ground that talks to it over Zenoh."""
+    """`companion run` with a folder of its own, and a ground that talks to it over Zenoh.
+
+    `settings` is the text of its companion.toml, unless a flag names one.
+    """
 
     def __init__(
         self,
@@ -185,8 +192,13 @@ class Companion(Process):
         *flags: str,
         before: str = "",
         environment: dict[str, str] | None = None,
+        settings: str = PATIENT,
     ) -> None:
         self.records = folder / "records"
+        if "--config" not in flags:
+            config = folder / "patient.toml"
+            config.write_text(settings)
+            flags = (*flags, "--config", str(config))
         self.zenoh_port = free_port(socket.SOCK_STREAM)
         program = f"{before}\nfrom companion.cli import main; main()"
         super().__init__(
@@ -204,11 +216,11 @@ class Companion(Process):
             environment,
         )
         self.ready()
-        config = zenoh.Config()
-        config.insert_json5("connect/endpoints", json.dumps([f"tcp/127.0.0.1:{self.zenoh_port}"]))
-        config.insert_json5("listen/endpoints", "[]")
-        config.insert_json5("scouting/multicast/enabled", "false")
-        self.session = zenoh.open(config)
+        zenoh_config = zenoh.Config()
+        zenoh_config.insert_json5("connect/endpoints", json.dumps([f"tcp/127.0.0.1:{self.zenoh_port}"]))
+        zenoh_config.insert_json5("listen/endpoints", "[]")
+        zenoh_config.insert_json5("scouting/multicast/enabled", "false")
+        self.session = zenoh.open(zenoh_config)
         self.ticks: list[Tick] = []
         self.events: list[Event] = []
         self._subscribers = [

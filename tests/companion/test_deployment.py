@@ -20,7 +20,7 @@ from onnx_models import (
     linear_model,
     nan_model,
 )
-from rig import Bridge, Companion, free_port, wait_for
+from rig import PATIENT, Bridge, Companion, free_port, wait_for
 
 from companion import inspection
 from companion.store import ModelStore
@@ -41,7 +41,7 @@ def companion(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Companion]:
     bridge = Bridge(port, "--speed", SPEED)
     folder = tmp_path_factory.mktemp("companion")
     config = folder / "companion.toml"
-    config.write_text("[guard]\ndeadline = 0.02\n[shadow]\nseconds = 1.0\n")
+    config.write_text(PATIENT + "[guard]\ndeadline = 0.02\n[shadow]\nseconds = 1.0\n")
     companion = Companion(folder, port, "--config", str(config))
     yield companion
     companion.end()

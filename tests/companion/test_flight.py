@@ -32,7 +32,9 @@ START = (3.0, -2.0, 0.4)
 class Rig:
     """A flight and a vehicle that moves as (9): accelerations follow the attitude, attitude the rates.
 
-    `push` is an acceleration (m/s², world) that nobody told the cascade of; the ground is where it starts.
+    `push` is an acceleration (m/s², world) that nobody told the cascade of; the ground is where it starts. What is told
+    of it trembles by a micrometre, as no estimate in use stands still. `moved`, `turned` (rad, heading) and `counter`
+    are resets of the estimate, `age` is that of the odometry, and while `still` it is repeated with new times.
     """
 
     safety: Safety = field(default_factory=Safety)
@@ -43,6 +45,12 @@ class Rig:
     position: list[float] = field(default_factory=lambda: list(START))
     velocity: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     tilt: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    moved: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turned: float = 0.0
+    counter: int = 0
+    age: float = 0.0
+    still: bool = False
+    _told: Odometry | None = None
 
     def __post_init__(self) -> None:
         law = ControlLaw(VEHICLE, DESIGN)
@@ -51,17 +59,24 @@ class Rig:
     def tick(self, dt_us: int = DT_US) -> Outcome:
         self.time_us += dt_us
         roll, pitch = self.tilt
-        quaternion = (math.cos(roll / 2) * math.cos(pitch / 2), math.sin(roll / 2), math.sin(pitch / 2), 0.0)
+        tremble = 1e-6 * (1 if self.time_us // DT_US % 2 else -1)
+        c, k = math.cos(0.5 * self.turned), math.sin(0.5 * self.turned)
+        w, i, j = math.cos(roll / 2) * math.cos(pitch / 2), math.sin(roll / 2), math.sin(pitch / 2) + tremble
+        quaternion = (c * w, c * i - k * j, c * j + k * i, k * w)
         size = math.hypot(*quaternion)
         odometry = Odometry(
             self.time_us,
             0,
-            tuple(self.position),
-            tuple(self.velocity),
+            tuple(x + dx for x, dx in zip(self.position, self.moved, strict=True)),
+            tuple(x + tremble for x in self.velocity),
             tuple(x / size for x in quaternion),
             (0.0, 0.0, 0.0),
-            0,
+            self.counter,
+            self.age,
         )
+        if self.still and self._told is not None:
+            odometry = self._told._replace(vehicle_time_us=self.time_us)
+        self._told = odometry
         out = self.flight.tick(odometry, self.latest)
         self.flight.watch(self.latest)
         if out.step is not None and self.latest.armed:
@@ -192,7 +207,7 @@ def test_a_pilot_also_wins_over_our_own_landing() -> None:
         (lambda rig: rig.tick(300_000), "odometry_gap"),
         (lambda rig: rig.tick(-50_000), "odometry_gap"),
         (lambda rig: rig.position.__setitem__(0, rig.position[0] + 1.5), "position_jump"),
-        (lambda rig: rig.position.__setitem__(2, rig.position[2] + 0.9), "geofence"),
+        (lambda rig: rig.velocity.__setitem__(2, 4.0), "geofence"),
         (lambda rig: rig.latest.__setattr__("battery_voltage", 12.0), "battery_low"),
     ],
 )

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mav
-from rig import Bridge, Companion, Wiretap, wait_for
+from rig import PATIENT, Bridge, Companion, Wiretap, wait_for
 
 from companion.pose import PoseFeed, PoseGate, PoseSettings
 from companion.vehicle_link import vision_estimate
@@ -209,7 +209,7 @@ def decoded(datagrams: list[bytes]) -> list[mav.MAVLink_vision_position_estimate
 
 def test_from_zenoh_to_the_wire_and_a_lost_feed_lands(tmp_path: Path) -> None:
     config = tmp_path / "companion.toml"
-    config.write_text("[pose]\nenabled = true\nstale = 1.0\nlost = 1.0\n")
+    config.write_text(PATIENT + "[pose]\nenabled = true\nstale = 1.0\nlost = 1.0\n")
     tap = Wiretap()
     bridge = Bridge(tap.port)
     companion = Companion(tmp_path, tap.companion_port, "--config", str(config))
