@@ -575,8 +575,8 @@ class Flight:
         if reset.distance > safety.reset or abs(reset.turned) > safety.reset_turn:
             self._land(f"the estimator was reset: {reset.text}", return_home=False, kind="estimator_reset")
             return True
-        text = f"the estimator was reset: {reset.text}; home and reference are carried over"
-        self.on_event("warning", "estimator_reset", text)
+        carried = "; home and reference are carried over" if reset.moves else ""
+        self.on_event("warning", "estimator_reset", f"the estimator was reset: {reset.text}{carried}")
         return False
 
     def _watch_guard(self) -> None:

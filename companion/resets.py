@@ -34,6 +34,11 @@ class Reset:
         return math.hypot(*self.moved)
 
     @property
+    def moves(self) -> bool:
+        """Whether it moves anything to speak of."""
+        return self.distance > _LEAST or abs(self.turned) > _LEAST_TURN
+
+    @property
     def text(self) -> str:
         """In words, such as 'the position jumped by 0.90 m (0.00, 0.00, 0.90)'."""
         parts = []

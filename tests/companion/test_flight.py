@@ -67,7 +67,7 @@ class Rig:
         odometry = Odometry(
             self.time_us,
             0,
-            tuple(x + dx for x, dx in zip(self.position, self.moved, strict=True)),
+            tuple(x + dx + tremble for x, dx in zip(self.position, self.moved, strict=True)),
             tuple(x + tremble for x in self.velocity),
             tuple(x / size for x in quaternion),
             (0.0, 0.0, 0.0),
