@@ -14,12 +14,14 @@ from companion.director import Director
 from companion.flight import IDLE, Flight
 from companion.pose import PoseFeed
 from companion.settings import Settings
+from companion.signature import Signatures
 from companion.store import ModelStore
-from companion.telemetry import Telemetry, make_event, read_json
+from companion.telemetry import ATTACHED, Telemetry, make_event, read_json
 from companion.tick import make_tick
 from companion.vehicle_link import Odometry, VehicleLink
 from companion.watchdog import Watchdog, raise_priority
-from companion.zenoh_session import open_session
+from companion.zenoh_session import INSECURE, open_planned, plan_session
+from models.contract import model_hash
 from models.design import load_design
 from models.errors import InputError
 from models.vehicle import load_vehicle
@@ -60,13 +62,26 @@ class Companion:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise InputError(f"{folder}: cannot make the folder ({error.strerror})") from None
-        store = ModelStore(Path(settings.models), vehicle, settings.guard.deadline)
-        session = open_session(settings.zenoh)
+        keys = settings.own_keys()
+        plan = plan_session(settings.zenoh, keys, vehicle.name)
+        signatures = Signatures(
+            Path(settings.models), vehicle.name, keys, settings.unsigned_models, bool(plan.exposed)
+        )
+        store = ModelStore(Path(settings.models), vehicle, settings.guard.deadline, signatures.stored)
+        signatures.sweep()
+        session = open_planned(plan)
         try:
             self.link = VehicleLink(settings.connect, settings.timeout, settings.system)
         except InputError:
             session.close()
             raise
+        self._signatures = signatures
+        self.access = {
+            "keys": keys.certificate if keys is not None else "",
+            "exposed": list(plan.exposed),
+            "loose": plan.loose,
+            "listen": list(plan.listen),
+        }
         self.flight = Flight(law, settings.safety, self.emit, settings.trim, settings.agreement)
         self.director = Director(
             self.link,
@@ -90,7 +105,7 @@ class Companion:
             session,
             vehicle.name,
             {
-                "status": lambda payload, parameters: self.director.status(),
+                "status": lambda payload, parameters: {**self.director.status(), "access": self.access},
                 "mission": lambda payload, parameters: self.director.request(read_json(payload)),
                 "model": self._model,
             },
@@ -102,6 +117,8 @@ class Companion:
             self.director.pose = self.pose
             self.link.share_clock()
             self.telemetry.subscribe("pose", self.pose.take)
+        if plan.exposed:
+            self.emit("error", "insecure", f"{INSECURE}; it {' and '.join(plan.exposed)}")
         for reason in store.refused_at_start:
             self.emit("warning", "model_refused", f"no longer accepted: {reason}")
         self.link.on_odometry = self._control
@@ -192,6 +209,11 @@ class Companion:
 
     def _model(self, payload: bytes, parameters: dict[str, str]) -> dict[str, Any]:
         if payload[:1] != b"{":
+            signature = parameters.get(ATTACHED, "").encode()
+            reason = self._signatures.admit(payload, signature)
+            if reason:
+                self.emit("warning", "model_refused", f"{model_hash(payload)}: {reason}")
+                return {"accepted": False, "reason": reason}
             shadow = parameters.get("shadow")
             try:
                 return self.director.deploy(payload, float(shadow) if shadow is not None else None)

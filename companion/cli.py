@@ -68,6 +68,14 @@ def run(
         Path | None, typer.Option("-c", "--zenoh-config", help="Zenoh configuration file.")
     ] = None,
     zenoh_cfg: Annotated[list[str] | None, typer.Option("--cfg", help="Zenoh setting, KEY:VALUE.")] = None,
+    keys: Annotated[
+        Path | None,
+        typer.Option(help="The vehicle's folder of `groundstation keys`: TLS, and who may do what."),
+    ] = None,
+    insecure: Annotated[
+        bool,
+        typer.Option("--insecure", help="Without keys: let anybody on the network read, fly and deploy."),
+    ] = False,
 ) -> None:
     """Connect, wait for missions, fly them.
 
@@ -77,6 +85,7 @@ def run(
     """
     from companion.app import Companion
     from companion.settings import load_settings
+    from companion.zenoh_session import INSECURE
 
     settings = load_settings(config)
     given: dict[str, Any] = {
@@ -88,6 +97,7 @@ def run(
         "timeout": timeout,
         "records": records,
         "models": models,
+        "keys": keys,
     }
     flags: dict[str, Any] = {
         name: value if isinstance(value, (int, float)) else str(value)
@@ -100,9 +110,8 @@ def run(
         "listen": tuple(zenoh_listen) if zenoh_listen else None,
         "config": str(zenoh_config) if zenoh_config else None,
         "cfg": tuple(zenoh_cfg) if zenoh_cfg else None,
+        "insecure": insecure or None,
     }
-    if zenoh_config and not zenoh_listen:
-        zenoh["listen"] = ()  # what the file says, not our default
     changes = {name: value for name, value in zenoh.items() if value is not None}
     settings = replace(settings, **flags, zenoh=replace(settings.zenoh, **changes))
 
@@ -117,7 +126,11 @@ def run(
     signal.signal(signal.SIGTERM, stop)
     rates = companion.director.rates
     assert rates is not None
-    where = ", ".join(settings.zenoh.listen) or settings.zenoh.config or "Zenoh"
+    if companion.access["exposed"]:
+        from rich.console import Console
+
+        Console(stderr=True).print(f"[bold red]{INSECURE}[/]; it {' and '.join(companion.access['exposed'])}")
+    where = ", ".join(companion.access["listen"]) or "Zenoh"
     ready = f"{companion.director.vehicle.name} at {rates.odometry:.0f} Hz on {settings.connect}, missions on {where}"
     typer.echo(f"ready: {ready}")
     sys.stdout.flush()

@@ -18,14 +18,17 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
+from companion.access import access_findings
 from companion.findings import FAIL, NOTE, OK, WARN, Finding
 from companion.inspection import inspect
 from companion.message_rates import link_too_slow, odometry_too_low
 from companion.settings import Settings
 from companion.store import live_file
 from companion.vehicle_link import VehicleLink
+from companion.zenoh_session import plan_session
 from models.design import load_design
 from models.errors import InputError
 from models.vehicle import Vehicle, load_vehicle
@@ -244,10 +247,17 @@ def _processor(settings: Settings, root: Path) -> Iterator[Finding]:
 
 
 def _zenoh(settings: Settings, root: Path) -> Iterator[Finding]:
-    for end in settings.zenoh.listen:
+    yield from access_findings(settings)
+    try:
+        keys = settings.own_keys()
+        plan = plan_session(settings.zenoh if keys else replace(settings.zenoh, insecure=True), keys)
+    except InputError:
+        return  # told above
+    named = "Zenoh" if settings.zenoh.listen or settings.zenoh.config else "Zenoh port"
+    for end in plan.listen:
         found = _PORT.match(end)
         if found is None:
-            yield Finding("Zenoh", end, "", "write tcp/ADDRESS:PORT", WARN)
+            yield Finding(named, end, "", "write tcp/ADDRESS:PORT", WARN)
             continue
         host, port = found.group(1), int(found.group(2))
         problem = _cannot_listen(host, port)
@@ -255,13 +265,13 @@ def _zenoh(settings: Settings, root: Path) -> Iterator[Finding]:
             advice = (
                 "another companion is running (systemctl status trueflight-companion), or choose another port"
             )
-            yield Finding("Zenoh", f"{end}: {problem}", "", advice, WARN)
+            yield Finding(named, f"{end}: {problem}", "", advice, WARN)
         elif host.startswith(_LOOPBACK):
-            advice = f"only this machine can reach it; for the ground listen on tcp/0.0.0.0:{port}"
-            yield Finding("Zenoh", f"{end} is free", "", advice, NOTE)
+            advice = "only this machine can reach it; for the ground make keys (groundstation keys)"
+            yield Finding(named, f"{end} is free", "", advice, NOTE)
         else:
-            yield Finding("Zenoh", f"{end} is free", "", "", OK)
-    for end in settings.zenoh.connect:
+            yield Finding(named, f"{end} is free", "", "", OK)
+    for end in plan.connect:
         found = _PORT.match(end)
         if found is None or not end.startswith("tcp/"):
             continue
@@ -271,8 +281,6 @@ def _zenoh(settings: Settings, root: Path) -> Iterator[Finding]:
         except OSError as error:
             advice = "start what listens there; check address and firewall"
             yield Finding("Zenoh", f"{end}: {error.strerror or 'no answer'}", "", advice, FAIL)
-    if settings.zenoh.config and not Path(settings.zenoh.config).is_file():
-        yield Finding("Zenoh", settings.zenoh.config, "", "this file is not there", FAIL)
 
 
 def _cannot_listen(host: str, port: int) -> str:

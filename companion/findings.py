@@ -9,10 +9,10 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-OK, NOTE, WARN, FAIL = STATES = ("ok", "note", "warn", "fail")
-"""How bad it is, mildest first; `note` is no judgement."""
+OK, NOTE, WARN, DANGER, FAIL = STATES = ("ok", "note", "warn", "danger", "fail")
+"""How bad it is, mildest first; `note` is no judgement, `danger` is what was asked for and bars no flight."""
 
-_STYLE = {OK: "green", NOTE: "dim", WARN: "yellow", FAIL: "bold red"}
+_STYLE = {OK: "green", NOTE: "dim", WARN: "yellow", DANGER: "bold red", FAIL: "bold red"}
 
 
 @dataclass(frozen=True)

@@ -98,6 +98,7 @@ def preflight_command(
         console.print(table_of("Parameters", report.parameters))
         console.print(table_of("Message rates", report.rates))
         console.print(table_of("Hover thrust", report.hover))
+        console.print(table_of("Who may fly it", report.access))
         for line in changed:
             console.print(escape(line), highlight=False)
         open_changes = [p.name for p in (*report.parameters, *report.hover) if p.change is not None]
@@ -151,7 +152,15 @@ def install_command(
     connect: Annotated[
         str, typer.Option(help="MAVSDK address of the autopilot.")
     ] = "serial:///dev/ttyAMA0:921600",
-    listen: Annotated[str, typer.Option(help="Zenoh endpoint for the ground.")] = "tcp/0.0.0.0:7447",
+    listen: Annotated[
+        str | None,
+        typer.Option(help="Zenoh endpoint for the ground; default: with keys everywhere, without here."),
+    ] = None,
+    keys: Annotated[Path | None, typer.Option(help="The vehicle's folder of `groundstation keys`.")] = None,
+    insecure: Annotated[
+        bool,
+        typer.Option("--insecure", help="Without keys: let anybody on the network read, fly and deploy."),
+    ] = False,
     user: Annotated[str, typer.Option(help="User that the companion runs as.")] = "trueflight",
     realtime: Annotated[int, typer.Option(help="Priority of the control thread, 0 for none.")] = 20,
     output: Annotated[Path, typer.Option("--output", "-o", help="Root that the files are put below.")] = Path(
@@ -168,7 +177,7 @@ def install_command(
     from companion.service import Service, install, next_steps, texts
 
     beside = design if design is not None else vehicle.with_name("design.json")
-    service = Service(vehicle, beside, connect, user, listen, realtime)
+    service = Service(vehicle, beside, connect, user, listen or "", realtime, keys=keys, insecure=insecure)
     done = install(service, output, dry_run)
     if as_json:
         files = {str(path): state for path, state in done}
@@ -204,6 +213,7 @@ def _settings(
     if not 10.0 <= settings.rate <= 1000.0:
         raise InputError(f"rate = {settings.rate:g} is outside 10 to 1000 Hz")
     settings.pose.checked()
+    settings.check_signing()
     return settings
 
 
@@ -219,7 +229,7 @@ def _poses(settings: Settings, vehicle: Vehicle | None, link: VehicleLink) -> It
     from companion.zenoh_session import open_session
     from models.contract import key
 
-    session = open_session(settings.zenoh)
+    session = open_session(settings.zenoh, settings.own_keys(), vehicle.name)
     feed = PoseFeed(settings.pose, link.send_pose, lambda level, kind, text: None)
     try:
         link.share_clock()

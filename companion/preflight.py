@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.access import access_findings
 from companion.findings import FAIL, NOTE, OK, WARN, Finding, rows_of
 from companion.message_rates import link_too_slow, odometry_too_low
 from companion.pose import PoseFeed
@@ -56,11 +57,12 @@ class Preflight:
     parameters: tuple[Parameter, ...]
     rates: tuple[Finding, ...]
     hover: tuple[Parameter, ...]
+    access: tuple[Finding, ...] = ()
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """All of them."""
-        return (*self.arming, *self.parameters, *self.rates, *self.hover)
+        return (*self.arming, *self.parameters, *self.rates, *self.hover, *self.access)
 
     @property
     def ready(self) -> bool:
@@ -262,6 +264,7 @@ def look(
         tuple(parameters),
         (*_rates(link, settings, rates), *_poses(pose)),
         tuple(hover),
+        tuple(access_findings(settings)),
     )
 
 
@@ -472,4 +475,5 @@ def as_json(report: Preflight) -> dict[str, Any]:
         "parameters": parameters,
         "rates": rows_of(report.rates),
         "hover_thrust": rows_of(report.hover),
+        "access": rows_of(report.access),
     }

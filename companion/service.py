@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from companion.zenoh_session import LOCAL, WITH_KEYS, ZenohSettings, plan_session
+from models.access import ACCESS, AUTHORITY, CERTIFICATE, PRIVATE_KEY, read_keys
 from models.errors import InputError
 from models.vehicle import load_vehicle
 
@@ -35,15 +37,20 @@ NEW, SAME, UPDATED, KEPT = "new", "unchanged", "updated", "kept, yours has chang
 
 @dataclass(frozen=True)
 class Service:
-    """What the service is to be: files of the vehicle, address of the autopilot, user, program, priority."""
+    """What the service is to be: files of the vehicle, address of the autopilot, user, program, priority.
+
+    `listen` empty: with `keys` every network, without this machine alone; `insecure` is for another address without.
+    """
 
     vehicle: Path
     design: Path
     connect: str
     user: str = "trueflight"
-    listen: str = "tcp/0.0.0.0:7447"
+    listen: str = ""
     realtime: int = 20
     program: str = ""
+    keys: Path | None = None
+    insecure: bool = False
 
     def checked(self) -> Service:
         """The same, or `InputError` for what a unit must not hold."""
@@ -57,12 +64,19 @@ class Service:
             raise InputError(f"--realtime {self.realtime} is outside 0 (off) to 80")
         if not re.fullmatch(r"[\x21-\x7e]+", self.connect):
             raise InputError(f"--connect '{self.connect}' holds blanks or control characters")
-        load_vehicle(self.vehicle)
+        vehicle = load_vehicle(self.vehicle)
+        keys = read_keys(self.keys) if self.keys is not None else None
+        plan_session(ZenohSettings(listen=(self.endpoint,), insecure=self.insecure), keys, vehicle.name)
         if not self.design.is_file():
             raise InputError(
                 f"{self.design}: no design file; make it with groundstation design, or pass --design"
             )
         return self
+
+    @property
+    def endpoint(self) -> str:
+        """Where it listens."""
+        return self.listen or (LOCAL if self.keys is None else WITH_KEYS)
 
     @property
     def command(self) -> str:
@@ -105,12 +119,36 @@ OOMScoreAdjust=-500
 LimitCORE=0
 Environment=OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
 
+# What it may touch: its own state, serial ports, the network.
 NoNewPrivileges=yes
+CapabilityBoundingSet=
 ProtectSystem=strict
 ProtectHome={home}
 PrivateTmp=yes
+PrivateMounts=yes
+UMask=0077
+RemoveIPC=yes
+DevicePolicy=closed
+{_devices()}
+ProtectProc=invisible
+ProtectClock=yes
+ProtectHostname=yes
 ProtectKernelTunables=yes
+ProtectKernelModules=yes
+ProtectKernelLogs=yes
 ProtectControlGroups=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+# Netlink: Zenoh asks which addresses this machine has.
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+# User and network: the check of a model locks itself into namespaces of its own.
+RestrictNamespaces=user net
+SystemCallArchitectures=native
+# What is not allowed fails, and does not kill: a flight goes on. Real-time priority and the limits of a model's check
+# are in @resources, which @system-service holds.
+SystemCallErrorNumber=EPERM
+SystemCallFilter=@system-service seccomp landlock_create_ruleset landlock_add_rule landlock_restrict_self
+SystemCallFilter=~@privileged @obsolete @keyring
 
 [Install]
 WantedBy=multi-user.target
@@ -126,9 +164,20 @@ m {service.user} dialout
         "realtime": str(service.realtime),
         "records": json.dumps(f"{STATE}/records"),
         "models": json.dumps(f"{STATE}/deployed"),
-        "listen": json.dumps([service.listen]),
+        "listen": json.dumps([service.endpoint]),
     }
+    if service.keys is not None:
+        values["keys"] = json.dumps(f"/{FOLDER}/keys")
+    if service.insecure:
+        values["insecure"] = "true"
     return {UNIT: unit, SYSUSERS: sysusers, CONFIG: _configured(values)}
+
+
+def _devices() -> str:
+    """Serial ports of every kind: which one it is stands in the configuration, and may change there."""
+    return "\n".join(
+        f"DeviceAllow=char-{kind} rw" for kind in ("ttyAMA", "ttyS", "ttyTHS", "ttyUSB", "ttyACM")
+    )
 
 
 def _configured(values: dict[str, str]) -> str:
@@ -153,10 +202,16 @@ def install(service: Service, root: Path, dry_run: bool = False) -> list[tuple[P
     for source, name in ((service.vehicle, "vehicle.toml"), (service.design, "design.json")):
         path = root / FOLDER / name
         done.append((path, _put(path, source.read_bytes(), dry_run, marked=False)))
+    if service.keys is not None:
+        for name in (AUTHORITY, CERTIFICATE, PRIVATE_KEY, ACCESS):
+            path = root / FOLDER / "keys" / name
+            done.append(
+                (path, _put(path, (service.keys / name).read_bytes(), dry_run, marked=False, mode=0o600))
+            )
     return done
 
 
-def _put(path: Path, text: bytes, dry_run: bool, marked: bool) -> str:
+def _put(path: Path, text: bytes, dry_run: bool, marked: bool, mode: int = 0o644) -> str:
     whole = _MARK.encode() + hashlib.sha256(text).hexdigest().encode() + b"\n" + text if marked else text
     try:
         there = path.read_bytes() if path.exists() else None
@@ -164,11 +219,13 @@ def _put(path: Path, text: bytes, dry_run: bool, marked: bool) -> str:
             return SAME
         state = NEW if there is None else UPDATED if marked and _untouched(there) else KEPT
         if not dry_run:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True, mode=0o755 if mode == 0o644 else 0o700)
             target = path if state != KEPT else path.with_name(path.name + ".new")
             part = target.with_name(target.name + ".part")
+            part.unlink(missing_ok=True)
+            part.touch(mode)
             part.write_bytes(whole)
-            part.chmod(0o644)
+            part.chmod(mode)
             part.replace(target)
         return state
     except OSError as error:
@@ -189,7 +246,12 @@ def next_steps(service: Service) -> Iterator[str]:
         yield "sudo systemd-sysusers                                   # makes the user"
     else:
         yield f"sudo useradd --system --groups dialout {service.user}"
+    doctor = f"companion doctor --config /{CONFIG}"
+    if service.keys is not None:
+        yield f"sudo chown -R {service.user}: /{FOLDER}/keys                # nobody else reads them"
+        program = Path(service.command.split()[0]).with_name("companion")
+        doctor = f"sudo -u {service.user} {program} doctor --config /{CONFIG}"
     yield "sudo systemctl daemon-reload"
-    yield f"companion doctor --config /{CONFIG}"
+    yield doctor
     yield "sudo systemctl enable --now trueflight-companion"
     yield "journalctl -u trueflight-companion -f"

@@ -13,8 +13,10 @@ from companion.controllers import TrimLimits
 from companion.flight import Safety
 from companion.pose import PoseSettings
 from companion.shadow import ShadowLimits
+from companion.signature import LOCAL, UNSIGNED
 from companion.watch import GuardLimits
 from companion.zenoh_session import ZenohSettings
+from models.access import Keys, read_keys
 from models.errors import InputError
 from models.outside import is_number, read_toml, shown
 
@@ -27,7 +29,8 @@ class Settings:
 
     `design` empty means `design.json` beside the vehicle file. `rate` in Hz, `timeout` in s to wait for an
     autopilot, `system` its MAVLink system id, 0 for the first that is heard. `realtime` is the priority (SCHED_FIFO)
-    that the control thread asks for, 0 for none.
+    that the control thread asks for, 0 for none. `keys` is the vehicle's folder of `groundstation keys`;
+    `unsigned_models` one of `companion.signature.UNSIGNED`.
     """
 
     vehicle: str = ""
@@ -47,6 +50,8 @@ class Settings:
     agreement: AgreementLimits = field(default_factory=AgreementLimits)
     pose: PoseSettings = field(default_factory=PoseSettings)
     realtime: int = field(default=0, metadata={"zero": True})
+    keys: str = ""
+    unsigned_models: str = LOCAL
 
     def checked(self) -> Settings:
         """The same, or `InputError` for a value without sense."""
@@ -61,9 +66,19 @@ class Settings:
         if not 0 <= self.realtime <= 80:
             raise InputError(f"realtime = {self.realtime} is outside 0 (off) to 80")
         self.pose.checked()
+        self.check_signing()
         if not self.vehicle:
             raise InputError("no vehicle file; pass --vehicle FILE or set 'vehicle' in the configuration")
         return self
+
+    def check_signing(self) -> None:
+        """Raise `InputError` for an `unsigned_models` without sense."""
+        if self.unsigned_models not in UNSIGNED:
+            raise InputError(f"unsigned_models = '{self.unsigned_models}' is none of {', '.join(UNSIGNED)}")
+
+    def own_keys(self) -> Keys | None:
+        """The vehicle's keys; None without. Raises `InputError` where they cannot be used."""
+        return read_keys(self.keys) if self.keys else None
 
     @property
     def design_path(self) -> Path:
@@ -84,7 +99,7 @@ def load_settings(path: str | Path | None) -> Settings:
     settings = _filled(Settings(), table, str(path), "")
     changes: dict[str, Any] = {
         name: str(path.parent / getattr(settings, name))
-        for name in ("vehicle", "design", "records", "models")
+        for name in ("vehicle", "design", "records", "models", "keys")
         if name in table and getattr(settings, name)
     }
     settings = replace(settings, **changes)

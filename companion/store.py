@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,11 +50,19 @@ class ModelStore:
 
     A model becomes live only after `companion.inspection` accepted it, and every one is checked again when the
     companion starts: the runtime or the vehicle file may have changed in between. What is live is on the disk
-    before it is told, so that a power cut leaves either the one before or this one.
+    before it is told, so that a power cut leaves either the one before or this one. `unsigned` says of a file why it
+    must not be opened ('' where it may): asked before anything reads it as a model.
     """
 
-    def __init__(self, folder: Path, vehicle: Vehicle, deadline: float) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        vehicle: Vehicle,
+        deadline: float,
+        unsigned: Callable[[Path], str] = lambda path: "",
+    ) -> None:
         self._folder, self._vehicle, self._deadline = folder, vehicle, deadline
+        self._unsigned = unsigned
         self._lock = threading.RLock()
         self._history: list[str] = []
         self._models: dict[str, Stored] = {}
@@ -100,6 +109,9 @@ class ModelStore:
             stored = self._models[name]
             if stored.model is None:
                 path = self._path(name, name == self._staged)
+                reason = self._unsigned(path)
+                if reason:
+                    raise InputError(f"model {name}: {reason}")
                 try:
                     stored.model = open_model(path.read_bytes(), stored.info)
                 except OSError as error:
@@ -232,10 +244,12 @@ class ModelStore:
     def _restore(self, names: list[str]) -> None:
         there = []
         for name in names:
-            if self._path(name).is_file():
-                there.append(name)
+            gone = "" if self._path(name).is_file() else "its file is gone"
+            reason = gone or self._unsigned(self._path(name))
+            if reason:
+                self.refused_at_start.append(f"{name}: {reason}")
             else:
-                self.refused_at_start.append(f"{name}: its file is gone")
+                there.append(name)
         findings = inspect([self._path(name) for name in there], self._vehicle, self._deadline)
         for name, finding in zip(there, findings, strict=True):
             if finding.info is None or finding.info.hash != name:

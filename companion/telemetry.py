@@ -11,6 +11,9 @@ file (`model?shadow=SECONDS`: how long to evaluate it in flight before it is app
 "offset", "length"}` for a piece of one record: its bytes as `application/octet-stream`, with JSON `{"size",
 "offset"}` attached; ask on until `offset` reaches `size`. * `pose`: subscribed, see `models.pose`.
 
+A request may name whom it is for (`?instance=ZENOH_ID`, as the answer to `status` comes from): another companion of the
+same name then stays silent. A model's signature (`models.signature`) is the attachment of its query.
+
 Every other answer is JSON with `accepted` and `reason`. Zenoh's callbacks only enqueue. The control thread
 never calls Zenoh: it hands serialised ticks to a publishing thread through a bounded queue and goes on. What
 takes long (the check of a model, pieces of a record) has a thread of its own, so that an order to land never
@@ -41,6 +44,10 @@ PIECE = 1 << 20
 """Greatest number of bytes of a record in one answer."""
 
 _SLOW = ("model", "record")
+INSTANCE = "instance"
+"""Parameter of a selector: the Zenoh identity of the one companion that is meant."""
+ATTACHED = "attachment"
+"""The parameter that a handler finds what was attached to the query in, as text."""
 
 Handler = Callable[[bytes, dict[str, str]], dict[str, Any]]
 """From a request's payload and the parameters of its selector to the answer."""
@@ -66,6 +73,7 @@ class Telemetry:
         self._session, self._records, self._vehicle = session, records, vehicle
         self._subscribers: list[zenoh.Subscriber[Any]] = []
         self._handlers = {"record": self._record, **handlers}
+        self._instance = str(session.info.zid())
         self._quick: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(REQUESTS_WAITING)
         self._slow: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(REQUESTS_WAITING)
         self._ticks: deque[bytes] = deque()
@@ -156,10 +164,15 @@ class Telemetry:
         requests = self._slow if leaf in _SLOW else self._quick
 
         def enqueue(query: zenoh.Query) -> None:
+            if _parameters(query).get(INSTANCE, self._instance) != self._instance:
+                query.drop()  # for another companion of this name
+                return
             try:
                 requests.put_nowait((leaf, query))
             except queue.Full:
-                _answer(query, {"accepted": False, "reason": "too many requests are waiting; ask again"})
+                self._answer(
+                    leaf, query, {"accepted": False, "reason": "too many requests are waiting; ask again"}
+                )
                 query.drop()
 
         return enqueue
@@ -170,11 +183,24 @@ class Telemetry:
             with query:
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
-                    parameters = dict(query.parameters)  # type: ignore[call-overload]
+                    parameters = _parameters(query)
+                    parameters.pop(INSTANCE, None)
+                    parameters.pop(ATTACHED, None)
+                    if query.attachment is not None:
+                        parameters[ATTACHED] = query.attachment.to_bytes().decode("utf-8", "replace")
                     answer = self._handlers[leaf](payload, parameters)
                 except Exception as error:  # noqa: BLE001 - one bad request must not end the service
                     answer = {"accepted": False, "reason": f"internal error: {type(error).__name__}: {error}"}
-                _answer(query, answer)
+                self._answer(leaf, query, answer)
+
+    def _answer(self, leaf: str, query: zenoh.Query, answer: dict[str, Any]) -> None:
+        """Reply under the own key: whoever asked `trueflight/*/status` wants to know who answers."""
+        key = contract.key(self._vehicle, leaf)
+        if "bytes" in answer:
+            attached = json.dumps({"size": answer["size"], "offset": answer["offset"]})
+            query.reply(key, answer["bytes"], encoding=_BYTES, attachment=attached)
+        else:
+            query.reply(key, json.dumps(answer), encoding=_JSON)
 
     def _record(self, payload: bytes, parameters: dict[str, str]) -> dict[str, Any]:
         request = read_json(payload)
@@ -216,9 +242,5 @@ def make_event(level: str, kind: str, text: str, vehicle_time_us: int = 0) -> Ev
     )
 
 
-def _answer(query: zenoh.Query, answer: dict[str, Any]) -> None:
-    if "bytes" in answer:
-        attached = json.dumps({"size": answer["size"], "offset": answer["offset"]})
-        query.reply(query.key_expr, answer["bytes"], encoding=_BYTES, attachment=attached)
-    else:
-        query.reply(query.key_expr, json.dumps(answer), encoding=_JSON)
+def _parameters(query: zenoh.Query) -> dict[str, str]:
+    return dict(query.parameters)  # type: ignore[call-overload]

@@ -1,14 +1,34 @@
-"""Zenoh's session, from a configuration file and the usual flags."""
+"""Zenoh's session, from keys, a configuration file and the usual flags."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import zenoh
 
+from models import access
+from models.access import Keys
 from models.errors import InputError
+from models.session import (
+    CONNECT,
+    ENCRYPTED,
+    LISTEN,
+    Claim,
+    claim,
+    claims_of,
+    configuration,
+    controlled,
+    endpoints,
+    exposed,
+    mode_of,
+    protocol,
+    short,
+)
+
+LOCAL, WITH_KEYS = "tcp/127.0.0.1:7447", "tls/0.0.0.0:7447"
+"""Where the companion listens when nobody says where: without keys this machine alone, with keys everywhere."""
+
+INSECURE = "insecure: anybody on the network can read, fly and deploy"
 
 
 @dataclass(frozen=True)
@@ -16,55 +36,118 @@ class ZenohSettings:
     """How to reach the ground: as Zenoh's own `-m -e -l -c --cfg`.
 
     `cfg` holds `KEY:VALUE` pairs, VALUE in JSON5. No router is needed and none is looked for: multicast
-    scouting is off unless the file or `cfg` turns it on.
+    scouting is off unless the file or `cfg` turns it on. Without keys, what another machine could reach needs
+    `insecure`.
     """
 
     mode: str = ""
     connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    listen: tuple[str, ...] = ()
     config: str = ""
     cfg: tuple[str, ...] = ()
+    insecure: bool = False
 
 
-def open_session(settings: ZenohSettings) -> zenoh.Session:
-    """Open the session; raises `InputError` for a setting that Zenoh does not take and for a port in use."""
-    if settings.config:
-        try:
-            config = zenoh.Config.from_file(Path(settings.config))
-        except zenoh.ZError as error:
-            raise InputError(f"{settings.config}: not a Zenoh configuration ({_short(error)})") from None
-    else:
-        config = zenoh.Config()
-        config.insert_json5("scouting/multicast/enabled", "false")
-    # Cached ticks and events are asked for by age.
-    config.insert_json5("timestamping/enabled", "true")
-    pairs = [
-        (name, json.dumps(list(ends)))
-        for name, ends in (("connect", settings.connect), ("listen", settings.listen))
-        if ends
+@dataclass(frozen=True)
+class Plan:
+    """What will be opened: Zenoh's configuration, where it listens and connects to, what is open to anybody.
+
+    `loose` is what a person should know who believes it closed: TLS of one's own without access control.
+    """
+
+    config: zenoh.Config
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    exposed: tuple[str, ...]
+    loose: str = ""
+
+    @property
+    def ends(self) -> str:
+        """The endpoints, for people."""
+        return ", ".join((*self.listen, *self.connect)) or "no endpoint"
+
+
+def plan_session(settings: ZenohSettings, keys: Keys | None = None, vehicle: str = "") -> Plan:
+    """What `open_session` would open; opens nothing.
+
+    Raises `InputError` where settings contradict each other or the keys, and where another machine could get in
+    without keys and `insecure` is not set.
+    """
+    told = "the setting [zenoh]"
+    given = [
+        claim(path, value, f"{flag} or {told} {name} = {value}")
+        for path, value, flag, name in (
+            ("mode", settings.mode, "-m", "mode"),
+            (CONNECT, list(settings.connect), "-e", "connect"),
+            (LISTEN, list(settings.listen), "-l", "listen"),
+        )
+        if value
     ]
-    inserts = [(f"{name}/endpoints", value) for name, value in pairs]
-    if settings.mode:
-        inserts.append(("mode", json.dumps(settings.mode)))
-    for pair in settings.cfg:
-        key, colon, value = pair.partition(":")
-        if not colon:
-            raise InputError(f"--cfg '{pair}': write KEY:VALUE, such as transport/link/tx/queue/size/data:4")
-        inserts.append((key.strip(), value.strip()))
-    for key, value in inserts:
-        try:
-            config.insert_json5(key, value)
-        except zenoh.ZError as error:
-            raise InputError(f"Zenoh does not take {key} = {value} ({_short(error)})") from None
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        ends = ", ".join(settings.listen) or "its endpoints"
+    given += claims_of(settings.cfg)
+    otherwise = [
+        claim(LISTEN, [WITH_KEYS if keys else LOCAL], ""),
+        claim("scouting/multicast/enabled", False, ""),
+        # Cached ticks and events are asked for by age.
+        claim("timestamping/enabled", True, ""),
+    ]
+    if keys is not None:
+        given += _with_keys(settings, keys, vehicle)
+    config = configuration(settings.config, given, otherwise)
+    listen, connect = endpoints(config, LISTEN), endpoints(config, CONNECT)
+    if keys is not None:
+        mode = mode_of(config)
+        if mode != "peer" or connect:
+            what = f"connecting to {connect[0]}" if connect else f"mode {mode}"
+            raise InputError(
+                f"{what} contradicts the keys in {keys.folder}: with keys the companion is a peer that "
+                "listens, and the ground connects; leave it out"
+            )
+        for end in (*listen, *connect):
+            if protocol(end) not in ENCRYPTED:
+                raise InputError(
+                    f"{end} is not encrypted, which contradicts the keys in {keys.folder}: write "
+                    f"tls/{end.partition('/')[2]}, or leave the keys out"
+                )
+    ways = () if keys is not None else tuple(exposed(config))
+    if ways and not settings.insecure:
         raise InputError(
-            f"cannot open the Zenoh session on {ends} ({_short(error)}); is another companion running? "
+            f"without keys the companion {' and '.join(ways)}, where anybody on the network could fly the vehicle: "
+            "make keys (`groundstation keys`) and pass --keys FOLDER, or say --insecure if you mean it"
+        )
+    reachable = any(protocol(end) in ENCRYPTED for end in (*listen, *connect))
+    loose = ""
+    if keys is None and reachable and not controlled(config):
+        loose = "whoever has a certificate may do everything: the configuration has no access control"
+    return Plan(config, tuple(listen), tuple(connect), ways, loose)
+
+
+def open_session(settings: ZenohSettings, keys: Keys | None = None, vehicle: str = "") -> zenoh.Session:
+    """Open the session; raises `InputError` as `plan_session`, and for a port in use."""
+    return open_planned(plan_session(settings, keys, vehicle))
+
+
+def open_planned(plan: Plan) -> zenoh.Session:
+    """Open what was planned; raises `InputError` with the endpoints that were tried."""
+    try:
+        return zenoh.open(plan.config)
+    except zenoh.ZError as error:
+        raise InputError(
+            f"cannot open the Zenoh session on {plan.ends} ({short(error)}); is another companion running? "
             "Choose another port with -l"
         ) from None
 
 
-def _short(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+def _with_keys(settings: ZenohSettings, keys: Keys, vehicle: str) -> list[Claim]:
+    if keys.role != access.VEHICLE:
+        raise InputError(
+            f"{keys.folder}: keys of {keys.name}, {keys.role}; a companion needs the folder vehicle-NAME of "
+            "`groundstation keys`"
+        )
+    if vehicle and vehicle != keys.name:
+        raise InputError(
+            f"{keys.folder}: keys of the vehicle '{keys.name}', but the vehicle file says '{vehicle}'; make keys for "
+            f"it: groundstation keys FOLDER --vehicle {vehicle}"
+        )
+    if settings.insecure:
+        raise InputError(f"--insecure contradicts the keys in {keys.folder}; leave one of them out")
+    return [claim(path, value, f"keys '{keys.folder}'") for path, value in access.transport(keys).items()]

@@ -11,6 +11,7 @@ from groundstation import (
     collect_commands,
     effect_commands,
     flight_commands,
+    keys_commands,
     pilot_commands,
     plan_commands,
     remainder_commands,
@@ -37,6 +38,7 @@ bound_commands.register(app)
 train_commands.register(app)
 pilot_commands.register(app)
 collect_commands.register(app)
+keys_commands.register(app)
 effect_commands.register(app)
 reproduce_commands.register(app)
 remainder_commands.register(app)

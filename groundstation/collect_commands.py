@@ -17,6 +17,7 @@ from groundstation.pilot_commands import (
     ConfigOption,
     ConnectOption,
     JsonOption,
+    KeysOption,
     ListenOption,
     ModeOption,
     NameOption,
@@ -24,6 +25,7 @@ from groundstation.pilot_commands import (
     ZenohOption,
     check_controller,
     link_settings,
+    warn,
 )
 from models.errors import InputError
 
@@ -61,6 +63,7 @@ def collect_command(
     zenoh_config: ZenohOption = None,
     cfg: CfgOption = None,
     timeout: TimeoutOption = None,
+    keys: KeysOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fly a whole training database through the companion and fetch each record: translations, steps, rotations,
@@ -76,8 +79,9 @@ def collect_command(
     sorties = {
         record_name(number, sortie): sortie for number, sortie in enumerate(database(seed, minutes), 1)
     }
-    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
+    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)
     with Link(settings) as link:
+        warn(link)
         asked = {"vehicle": link.vehicle, "seed": seed, "minutes": minutes, "controller": controller}
         collection = Collection(output, {"flown_by": "groundstation collect", **asked})
         reason = _fly_missing(link, sorties, collection, controller, patience, as_json)

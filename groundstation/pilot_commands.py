@@ -41,6 +41,9 @@ CfgOption = Annotated[list[str] | None, typer.Option("--cfg", help="Zenoh settin
 TimeoutOption = Annotated[
     float | None, typer.Option("--timeout", help="Seconds to wait for an answer.", min=0.1)
 ]
+KeysOption = Annotated[
+    Path | None, typer.Option("--keys", help="Your folder of `groundstation keys`: TLS, and what you may do.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 STYLES = {"warning": "yellow", "error": "red"}
@@ -71,6 +74,7 @@ def link_settings(
     zenoh_config: Path | None,
     cfg: list[str] | None,
     timeout: float | None,
+    keys: Path | None = None,
 ) -> Settings:
     """The settings of a link: those of the file, overridden by the options given."""
     from groundstation.settings import load_settings
@@ -83,8 +87,17 @@ def link_settings(
         "zenoh_config": str(zenoh_config) if zenoh_config else None,
         "cfg": tuple(cfg) if cfg else None,
         "timeout": timeout,
+        "keys": str(keys) if keys is not None else None,
     }
     return replace(load_settings(config), **{key: value for key, value in given.items() if value is not None})
+
+
+def warn(link: Link) -> None:
+    """Tell in red, beside what is printed, where anybody on the network could do the same."""
+    if link.warning:
+        Console(stderr=True).print(
+            f"[bold red]{escape(link.warning)}[/] (groundstation keys)", highlight=False
+        )
 
 
 def check_controller(controller: str) -> None:
@@ -116,6 +129,7 @@ def fly_command(
     zenoh_config: ZenohOption = None,
     cfg: CfgOption = None,
     timeout: TimeoutOption = None,
+    keys: KeysOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Ask the companion to fly a trajectory; with --wait, follow it and fetch the flight record."""
@@ -124,10 +138,11 @@ def fly_command(
         return
     check_controller(controller)
     mission = {**_mission(trajectory, parameters or []), "controller": controller, "repeat": repeat}
-    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
+    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)
     from groundstation.link import Link
 
     with Link(settings) as link:
+        warn(link)
         events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         if wait:
             link.follow(on_event=events.put)
@@ -293,6 +308,7 @@ def deploy_command(
     zenoh_config: ZenohOption = None,
     cfg: CfgOption = None,
     timeout: TimeoutOption = None,
+    keys: KeysOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Send a model to the companion, which checks it and makes it live, or says why not.
@@ -306,8 +322,9 @@ def deploy_command(
     if roll_back and (model is not None or shadow is not None):
         raise InputError("--roll-back goes back to the previous model; leave the file and --shadow out")
     onnx = b"" if roll_back else _read_onnx(model)
-    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)
+    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)
     with Link(settings) as link:
+        warn(link)
         vehicle = link.vehicle
         events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         if roll_back:
@@ -435,14 +452,16 @@ def status_command(
     zenoh_config: ZenohOption = None,
     cfg: CfgOption = None,
     timeout: TimeoutOption = None,
+    keys: KeysOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """What the companion is doing, and whether it could fly now."""
     from groundstation.link import Link
 
-    with Link(link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)) as link:
+    with Link(link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)) as link:
         status = link.status()
         records = link.records()
+        warn(link)
     if as_json:
         typer.echo(json.dumps({**status, "records": records}, indent=1))
         return
@@ -504,12 +523,14 @@ def monitor_command(
     zenoh_config: ZenohOption = None,
     cfg: CfgOption = None,
     timeout: TimeoutOption = None,
+    keys: KeysOption = None,
 ) -> None:
     """Watch a vehicle live in Rerun: path, reference, commands, correction, guard, latency."""
     from groundstation.link import Link
     from groundstation.views import monitor
 
-    with Link(link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout)) as link:
+    with Link(link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)) as link:
+        warn(link)
         console.print(f"watching '{link.vehicle}'; Ctrl-C ends", highlight=False)
         seen = monitor(link, save, seconds)
     console.print(f"{seen} ticks seen" + (f", written to {escape(str(save))}" if save is not None else ""))

@@ -11,7 +11,7 @@ from models.errors import InputError
 from models.outside import is_number, read_toml, shown
 from models.vehicle import check_name
 
-TEXTS = ("name", "mode", "zenoh_config", "flights")
+TEXTS = ("name", "mode", "zenoh_config", "flights", "keys")
 
 
 @dataclass(frozen=True)
@@ -19,18 +19,25 @@ class Settings:
     """What the ground needs to find a companion.
 
     `name` of the vehicle (empty: the only one that answers), Zenoh's `mode`, endpoints to `connect` and
-    `listen` to, a `zenoh_config` file and further `cfg` pairs `KEY:VALUE`; `timeout` in s to wait for an
-    answer; `flights` is the folder that records are fetched to.
+    `listen` to (none: `default_connect`), a `zenoh_config` file and further `cfg` pairs `KEY:VALUE`; `timeout` in s
+    to wait for an answer; `flights` is the folder that records are fetched to; `keys` one's folder of
+    `groundstation keys`.
     """
 
     name: str = ""
-    mode: str = "peer"
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    mode: str = ""
+    connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     zenoh_config: str = ""
     cfg: tuple[str, ...] = ()
     timeout: float = 5.0
     flights: str = "flights"
+    keys: str = ""
+
+    @property
+    def default_connect(self) -> str:
+        """Where a companion is looked for when nobody says where."""
+        return f"{'tls' if self.keys else 'tcp'}/127.0.0.1:7447"
 
 
 def load_settings(path: Path | None) -> Settings:
@@ -56,7 +63,7 @@ def load_settings(path: Path | None) -> Settings:
                 raise InputError(f"{path}: '{key}' must be a text, not {shown(value)}")
             if key == "name" and value:
                 check_name(value, f"{path}: 'name'")
-            in_file = key in ("zenoh_config", "flights") and value
+            in_file = key in ("zenoh_config", "flights", "keys") and value
             changes[key] = str(path.parent / value) if in_file else value
         else:
             if not isinstance(value, list) or not all(isinstance(v, str) for v in value):

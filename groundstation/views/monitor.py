@@ -98,6 +98,8 @@ class Monitor:
 
     def run(self, link: Link, seconds: float | None = None) -> int:
         """Follow `link` until interrupted or for `seconds`; returns how many ticks were seen."""
+        if link.warning:
+            self.stream.log("events", rr.TextLog(link.warning, level="ERROR"), static=False)
         link.follow(self._ticks.put, self._events.put, history=HISTORY)
         end = time.monotonic() + seconds if seconds is not None else np.inf
         asked = -np.inf
@@ -108,6 +110,7 @@ class Monitor:
                     asked = time.monotonic()
                     with contextlib.suppress(InputError):  # the link may drop; ticks say the rest
                         self._models = link.ask("status", timeout=ASK)
+                        self._models["insecure"] = link.warning
                 self.update()
         except KeyboardInterrupt:
             pass
@@ -187,6 +190,7 @@ def state(vehicle: str, tick: Tick | None, silent: float, models: dict[str, Any]
     lines = [
         head,
         "",
+        *([f"**INSECURE**: {known['insecure']}", ""] if known.get("insecure") else []),
         "| | |",
         "|---|---|",
         f"| mode | **{tick.flight_mode or 'unknown'}**, {'armed' if tick.armed else 'disarmed'} |",

@@ -32,7 +32,7 @@ def test_everything_is_there_and_the_configuration_holds_what_was_asked_for(tmp_
     assert settings.vehicle == f"/{FOLDER}/vehicle.toml"
     assert settings.records == "/var/lib/trueflight/records"
     assert settings.realtime == 15
-    assert settings.zenoh.listen == ("tcp/0.0.0.0:7447",)
+    assert settings.zenoh.listen == ("tcp/127.0.0.1:7447",), "without keys this machine alone"
     assert settings.safety == Settings().safety
     assert settings.guard == Settings().guard
     text = (tmp_path / CONFIG).read_text()
