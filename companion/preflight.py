@@ -74,7 +74,7 @@ class Preflight:
 class Wish:
     """What a parameter should be: `good` tells whether a value is, `change` makes one of what is there.
 
-    `state` is how bad it is where it is not.
+    `state` is how bad it is where it is not; `otherwise` is looked at in a PX4 that does not have the parameter.
     """
 
     name: str
@@ -84,6 +84,7 @@ class Wish:
     change: Callable[[Number], Number | None]
     state: str = FAIL
     reboot: bool = False
+    otherwise: Wish | None = None
 
 
 def wishes(settings: Settings) -> list[Wish]:
@@ -115,6 +116,14 @@ def wishes(settings: Settings) -> list[Wish]:
             lambda v: bool(int(v) & 2),
             lambda v: int(v) | 2,
             WARN,
+            otherwise=Wish(
+                "MAN_OVERRIDE_SPD",
+                "0 or more",
+                "moving the sticks this fast takes over; negative: never (PX4 1.18)",
+                lambda v: v >= 0.0,
+                lambda v: 1.0,
+                WARN,
+            ),
         ),
         Wish(
             "COM_RCL_EXCEPT",
@@ -123,6 +132,14 @@ def wishes(settings: Settings) -> list[Wish]:
             lambda v: True,
             lambda v: None,
             NOTE,
+        ),
+        Wish(
+            "EKF2_NOAID_TOUT",
+            "at most 1000000 us",
+            "how long PX4 1.16 and later calls a position without GPS or mocap valid, and drifts",
+            lambda v: v <= 1_000_000,
+            lambda v: 1_000_000,
+            WARN,
         ),
         Wish(
             "COM_LOW_BAT_ACT",
@@ -254,7 +271,7 @@ def look(
     parameters = []
     for wish in wishes(settings):
         progress(wish.name)
-        parameters.append(_parameter(link, wish))
+        parameters.append(judge(link, wish))
     progress("hover thrust")
     records = Path(settings.records)
     hover = list(_hover(link, vehicle, records))
@@ -275,7 +292,7 @@ def set_parameters(link: VehicleLink, parameters: Sequence[Parameter]) -> list[s
         if parameter.change is None:
             continue
         reason = link.set_parameter(parameter.name, parameter.change)
-        done = f"{parameter.name}: {parameter.value} -> {parameter.change:g}"
+        done = f"{parameter.name}: {parameter.value} -> {_shown(parameter.change)}"
         after = "; acts after the autopilot's restart" if parameter.reboot else ""
         lines.append(f"{parameter.name} not set: {reason}" if reason else done + after)
     return lines
@@ -359,16 +376,23 @@ def _poses(feed: PoseFeed | None) -> Iterator[Finding]:
         yield Finding("poses refused", told, "0", "stale, jumping or no pose at all", WARN)
 
 
-def _parameter(link: VehicleLink, wish: Wish) -> Parameter:
+def _shown(value: Number) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
+
+
+def judge(link: VehicleLink, wish: Wish) -> Parameter:
+    """What the autopilot has where a wish stands, and what should become of it."""
     value = link.parameter(wish.name)
+    if value is None and wish.otherwise is not None:
+        return judge(link, wish.otherwise)
     if value is None:
         return Parameter(wish.name, "not there", wish.wanted, wish.why, NOTE)
     if wish.good(value):
-        return Parameter(wish.name, f"{value:g}", wish.wanted, wish.why, NOTE if wish.state == NOTE else OK)
+        return Parameter(wish.name, _shown(value), wish.wanted, wish.why, NOTE if wish.state == NOTE else OK)
     change = wish.change(value)
     if change is not None:
         change = type(value)(change)  # PX4 takes an INT32 as an INT32 only
-    return Parameter(wish.name, f"{value:g}", wish.wanted, wish.why, wish.state, change, wish.reboot)
+    return Parameter(wish.name, _shown(value), wish.wanted, wish.why, wish.state, change, wish.reboot)
 
 
 def _rates(link: VehicleLink, settings: Settings, rates: Rates) -> Iterator[Finding]:

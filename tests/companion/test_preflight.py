@@ -16,7 +16,7 @@ from test_companion_cli import companion
 
 from companion.message_rates import odometry_too_low
 from companion.pose import PoseSettings
-from companion.preflight import hover_of, wishes
+from companion.preflight import hover_of, judge, wishes
 from companion.settings import Settings
 from companion.vehicle_link import Rates
 
@@ -180,3 +180,22 @@ def test_hover_thrust_is_learned_from_hover_alone() -> None:
     low = ticks(5.0, 0.41)
     low["position"][:, 2] = 0.2
     assert hover_of(low, "in ground effect") is None
+
+
+class _Autopilot:
+    """Answers for parameters alone."""
+
+    def __init__(self, parameters: dict[str, float | int]) -> None:
+        self.parameter = parameters.get
+
+
+def test_a_parameter_that_a_release_renamed_is_looked_for_under_its_new_name() -> None:
+    wish = next(wish for wish in wishes(Settings()) if wish.name == "COM_RC_OVERRIDE")
+    old = judge(_Autopilot({"COM_RC_OVERRIDE": 1}), wish)  # type: ignore[arg-type]
+    new = judge(_Autopilot({"MAN_OVERRIDE_SPD": -1.0}), wish)  # type: ignore[arg-type]
+    assert (old.name, old.value, old.change) == ("COM_RC_OVERRIDE", "1", 3)
+    assert (new.name, new.state, new.change) == ("MAN_OVERRIDE_SPD", "warn", 1.0)
+    assert judge(_Autopilot({"MAN_OVERRIDE_SPD": 1.0}), wish).state == "ok"  # type: ignore[arg-type]
+    assert judge(_Autopilot({}), wish).state == "note"  # type: ignore[arg-type]
+    wish = next(wish for wish in wishes(Settings()) if wish.name == "EKF2_NOAID_TOUT")
+    assert judge(_Autopilot({"EKF2_NOAID_TOUT": 5_000_000}), wish).value == "5000000"  # type: ignore[arg-type]
