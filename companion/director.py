@@ -42,7 +42,7 @@ _STALLED, _GONE = (
     10.0,
 )  # s without a tick that are told, and without any sign of the vehicle that end a flight
 _ORDER_TIMEOUT = 0.2  # s for the next tick
-_LEAST_MODE_RATE = 4.0  # Hz: two messages within the time after which nothing is sent without any
+_LEAST_MODE_RATE = 0.8  # Hz: PX4 1.14 gives 1 whatever is asked for (HEARTBEAT alone), later ones 3
 _SHADOW_SECONDS = (0.5, 600.0)
 _MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
 

@@ -39,8 +39,11 @@ _TUMBLED = 1.4
 """rad of tilt, twice what the cascade may ask for: a vehicle there for longer than `_TUMBLING` s has crashed, or
 nothing that a linear design sends can bring it back."""
 _TUMBLING = 0.5
-_MODE_UNKNOWN = 0.5
-"""s of the vehicle's clock without a word of mode and arming after which nothing is sent until they are told again."""
+_MODE_UNKNOWN = 2.5
+"""s of the vehicle's clock without a word of mode and arming after which nothing is sent until they are told again.
+
+PX4 sends HEARTBEAT once a second whatever is asked for, and CURRENT_MODE (from 1.15 on) twice a second and at once when
+the mode changes: two heartbeats may be lost."""
 
 
 @dataclass(frozen=True)

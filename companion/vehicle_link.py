@@ -99,7 +99,9 @@ _MODES = {
 _MODE_NUMBERS = {"OFFBOARD": (6, 0), "LAND": (4, 6), "HOLD": (4, 3)}
 _LANDED = {0: "unknown", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
 _RECENT = 2.0  # s
-_MODE_RATE = 50.0  # Hz: a pilot who takes over is heard within 0.02 s instead of 1 s
+_MODE_RATE = (
+    50.0  # Hz: PX4 looks so often for a change of mode, and then tells it (CURRENT_MODE, from 1.15 on)
+)
 _TIMESYNC_RATE = 50.0  # Hz; PX4 wants 500 answers
 _RPM = 2.0 * math.pi / 60.0
 _AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
