@@ -42,7 +42,8 @@ _STALLED, _GONE = (
     10.0,
 )  # s without a tick that are told, and without any sign of the vehicle that end a flight
 _ORDER_TIMEOUT = 0.2  # s for the next tick
-_LEAST_MODE_RATE = 0.8  # Hz: PX4 1.14 gives 1 whatever is asked for (HEARTBEAT alone), later ones 3
+_LEAST_MODE_RATE = 0.4  # Hz: PX4 1.14 gives 1 whatever is asked for (HEARTBEAT alone), later ones 3
+_MODE_MEASURED = 1.5  # s of measuring below which so rare a message may well be missing
 _SHADOW_SECONDS = (0.5, 600.0)
 _MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
 
@@ -243,7 +244,7 @@ class Director:
             return f"odometry had a gap of {rates.longest_gap:.2f} s; the link or this machine is too busy"
         if rates.imu < 0.5 * min(self.rate, 100.0):
             return link_too_slow(f"HIGHRES_IMU at {rates.imu:.0f} Hz")
-        if rates.mode < _LEAST_MODE_RATE:
+        if rates.duration > _MODE_MEASURED and rates.mode < _LEAST_MODE_RATE:
             what = f"the flight mode (HEARTBEAT, CURRENT_MODE) at {rates.mode:.1f} Hz, so that a pilot is heard late,"
             return link_too_slow(what)
         return ""
