@@ -25,6 +25,8 @@ _SAME_RATE = 0.02
 """Clocks that run this much alike are taken to run alike: real ones do, simulated time may not."""
 _BUCKET, _BUCKETS = 1.0, 5
 """The fastest arrival is that of the last `_BUCKETS` times `_BUCKET` s."""
+_SLIP = 0.02
+"""s each second by which the vehicle's clock may be slow without that being taken for age: PX4's SIH is 0.01 slow."""
 _LEAK = 0.001
 """s each second by which the usual age may grow: so fast is a slower link taken for the usual one."""
 _RESTART = 1.0
@@ -81,7 +83,8 @@ class Arrivals:
     """Judges sample after sample of one stream; everything on one thread.
 
     The age is measured by the vehicle's clock. Where that is not told, it is what a sample needed more than the fastest
-    of the last seconds: a delay that is always there is not seen then.
+    of the last seconds: a delay that is always there is not seen then. PX4 1.14 to 1.18 never tell it through MAVSDK:
+    they address their answers to whoever stands in memory they did not fill, and MAVSDK drops what is not for us.
     """
 
     def __init__(self) -> None:
@@ -93,7 +96,7 @@ class Arrivals:
         self._done_ns = 0
         self._usual = math.inf
         self._usual_ns = 0
-        self._fastest: deque[tuple[int, int]] = deque(maxlen=_BUCKETS)
+        self._fastest: deque[tuple[int, int, int]] = deque(maxlen=_BUCKETS)
 
     def judge(self, vehicle_us: int, host_ns: int) -> Arrival:
         """The arrival at `host_ns` (monotonic, now) of the sample that is of `vehicle_us` by the vehicle's clock."""
@@ -122,7 +125,8 @@ class Arrivals:
             return 1e-9 * (now - stamp_ns)
         bucket, way = host_ns // round(_BUCKET * 1e9), host_ns - stamp_ns
         if not self._fastest or self._fastest[-1][0] != bucket:
-            self._fastest.append((bucket, way))
+            self._fastest.append((bucket, way, host_ns))
         elif way < self._fastest[-1][1]:
-            self._fastest[-1] = (bucket, way)
-        return 1e-9 * (way - min(way for _, way in self._fastest))
+            self._fastest[-1] = (bucket, way, host_ns)
+        fastest = min(least + _SLIP * (host_ns - at) for _, least, at in self._fastest)
+        return max(1e-9 * (way - fastest), 0.0)
