@@ -197,6 +197,8 @@ class Flight:
     _low_since: float = math.inf
     _tumbled_since: float = math.inf
     _late_since: float = math.inf
+    _handed_over: bool = False
+    """The autopilot lands by its own mode: nothing is sent any more, whatever mode comes after."""
     agrees: Agreement = field(init=False)
     _reset: Reset | None = None
     _turned: float = 0.0
@@ -223,7 +225,7 @@ class Flight:
                 self._guarded = mission.guard.live if mission.guard is not None else ""
                 self._controller = make_controller(mission.controller, self.law, mission.guard, self.trim)
                 self._legs.clear()
-                self._leg, self.wants_land = None, False
+                self._leg, self.wants_land, self._handed_over = None, False, False
                 self._low_since = self._tumbled_since = self._late_since = math.inf
                 self._turned, self._reset = 0.0, None
 
@@ -388,7 +390,7 @@ class Flight:
         if self._leg is None:
             out.step = IDLE_STEP if odometry.age <= self.safety.stale else None
             return out
-        if latest.flight_mode != "OFFBOARD":
+        if latest.flight_mode != "OFFBOARD" or self._handed_over:
             return out  # landing by the autopilot's own mode
         if odometry.age > self.safety.stale:
             self._stale(odometry.age)
@@ -512,6 +514,7 @@ class Flight:
             self._finish(self.outcome or "finished")
         elif latest.flight_mode != "OFFBOARD" and self.phase != SILENT:
             if self.wants_land and latest.flight_mode == "LAND":
+                self._handed_over = True
                 return
             if latest.failsafe:
                 text = (

@@ -201,6 +201,19 @@ def test_a_pilot_also_wins_over_our_own_landing() -> None:
     assert rig.flight.phase == SILENT
 
 
+def test_nothing_is_sent_once_the_autopilot_lands_even_if_its_mode_comes_back() -> None:
+    """PX4 falls back to Offboard when it disarms after a landing of its own, before its heartbeat says disarmed."""
+    rig = Rig()
+    rig.take_off(fly("hover", duration=1.0))
+    rig.until(LANDING)
+    while not rig.flight.wants_land:
+        rig.tick()
+    rig.latest.flight_mode = "LAND"
+    rig.run(0.2)
+    rig.latest.flight_mode = "OFFBOARD"
+    assert all(rig.tick().step is None for _ in range(20))
+
+
 @pytest.mark.parametrize(
     ("trouble", "kind"),
     [
