@@ -5,6 +5,11 @@ queue, in a buffer of the system or on the link. The sample's own stamp does, on
 says now. TIMESYNC asks for that: the autopilot stamps its answer with its clock at some moment after our question
 left, so that each answer bounds the vehicle's present from above, however late the answer itself was read. The least
 bound of the last few is taken; what it is off by is what the fastest question needed to get there.
+
+PX4 1.14 to 1.18 never tell it through MAVSDK: they address their answers to whoever stands in memory that they did not
+fill, and MAVSDK drops what is not for us. PX4 answers to PING instead, without its time; but the answer stands in the
+same queue as the odometry, so that the odometry read just before it tells the time of the answer to within a period.
+What delays the odometry alone is not seen in that way, and what delays all of it is.
 """
 
 from __future__ import annotations
@@ -54,11 +59,12 @@ class VehicleClock:
         self._rate = 1.0
 
     def due(self, host_ns: int) -> bool:
-        """Whether it is time to ask again; a question is then taken to leave at `host_ns`."""
-        if self._asked and host_ns - self._asked[-1] < ASK_EVERY * 1e9:
-            return False
+        """Whether it is time to ask again."""
+        return not self._asked or host_ns - self._asked[-1] >= ASK_EVERY * 1e9
+
+    def ask(self, host_ns: int) -> None:
+        """A question leaves at `host_ns`."""
         self._asked.append(host_ns)
-        return True
 
     def answered(self, asked_ns: int, vehicle_ns: int) -> None:
         """The vehicle's clock said `vehicle_ns` some time after `asked_ns`. What nobody asked is no answer."""
@@ -82,13 +88,12 @@ class VehicleClock:
 class Arrivals:
     """Judges sample after sample of one stream; everything on one thread.
 
-    The age is measured by the vehicle's clock. Where that is not told, it is what a sample needed more than the fastest
-    of the last seconds: a delay that is always there is not seen then. PX4 1.14 to 1.18 never tell it through MAVSDK:
-    they address their answers to whoever stands in memory they did not fill, and MAVSDK drops what is not for us.
+    The age is measured by the vehicle's clock, `clock` by TIMESYNC or `echo` by PING. Where neither is answered, it is
+    what a sample needed more than the fastest of the last seconds: a delay that is always there is not seen then.
     """
 
     def __init__(self) -> None:
-        self.clock = VehicleClock()
+        self.clock, self.echo = VehicleClock(), VehicleClock()
         self.overtaken = 0
         self.repeated = 0
         self.last_us = -1
@@ -115,6 +120,11 @@ class Arrivals:
         self.overtaken += overtaken
         return Arrival(age, overtaken, True)
 
+    def echoed(self, asked_ns: int) -> None:
+        """The answer to the PING that left at `asked_ns` has been read, after the last sample."""
+        if self.last_us >= 0:
+            self.echo.answered(asked_ns, 1000 * self.last_us)
+
     def done(self, host_ns: int) -> None:
         """The control law has answered to the last sample."""
         self._done_ns = host_ns
@@ -123,6 +133,9 @@ class Arrivals:
         now = self.clock.now(host_ns)
         if now is not None:
             return 1e-9 * (now - stamp_ns)
+        now = self.echo.now(host_ns)
+        if now is not None:
+            return max(1e-9 * (now - stamp_ns), 0.0)
         bucket, way = host_ns // round(_BUCKET * 1e9), host_ns - stamp_ns
         if not self._fastest or self._fastest[-1][0] != bucket:
             self._fastest.append((bucket, way, host_ns))

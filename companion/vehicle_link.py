@@ -269,6 +269,7 @@ class VehicleLink:
             ("ESTIMATOR_STATUS", self._estimator),
             ("AUTOPILOT_VERSION", self._autopilot_version),
             ("TIMESYNC", self._timesync),
+            ("PING", self._pinged),
         ):
             self._direct.subscribe_message(name, self._safe(handler))
         self._direct.subscribe_message("HIGHRES_IMU", self._imu)
@@ -526,7 +527,18 @@ class VehicleLink:
             self._ask_time(now)
 
     def _ask_time(self, now_ns: int) -> None:
-        self._send_timesync(f'{{"tc1":0,"ts1":{now_ns},"target_system":{self._system},"target_component":1}}')
+        asked = now_ns // 1000 * 1000  # PING tells whole microseconds
+        arrivals = self.arrivals
+        arrivals.clock.ask(asked)
+        self._send_timesync(f'{{"tc1":0,"ts1":{asked},"target_system":{self._system},"target_component":1}}')
+        if arrivals.clock.now(asked) is None:
+            arrivals.echo.ask(asked)
+            fields = f'{{"time_usec":{asked // 1000},"seq":0,"target_system":0,"target_component":0}}'
+            self._direct.send_message(MavlinkMessage("PING", fields_json=fields))
+
+    def _pinged(self, fields: dict[str, Any]) -> None:
+        if int(fields["target_system"]):  # an answer
+            self.arrivals.echoed(1000 * int(fields["time_usec"]))
 
     def _send_timesync(self, fields: str) -> None:
         self._direct.send_message(

@@ -44,6 +44,7 @@ class Commands:
             "MISSION_COUNT": self._mission_refused,
             "MISSION_CLEAR_ALL": self._mission_cleared,
             "TIMESYNC": self._timesync,
+            "PING": self._ping,
         }
 
     def handle(self, message: Any, peer: Peer) -> Reply:
@@ -259,6 +260,12 @@ class Commands:
     def _mission_cleared(self, message: Any, peer: Peer) -> Reply:
         source = message.get_srcSystem(), message.get_srcComponent()
         return [mav.MAVLink_mission_ack_message(*source, mav.MAV_MISSION_ACCEPTED, message.mission_type)]
+
+    def _ping(self, message: Any, peer: Peer) -> Reply:
+        if message.target_system or message.target_component:
+            return ()
+        source = message.get_srcSystem(), message.get_srcComponent()
+        return [mav.MAVLink_ping_message(message.time_usec, message.seq, *source)]
 
     def _timesync(self, message: Any, peer: Peer) -> Reply:
         if message.tc1:

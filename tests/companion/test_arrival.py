@@ -30,9 +30,33 @@ def flown(
         read = moment + round((way + behind) * S)
         ages.append(arrivals.judge(stamp, read).age)
         arrivals.done(read + MS)
-        if arrivals.clock.due(read + MS) and answers:
-            arrivals.clock.answered(read + MS, round((read + 2 * MS - begin) * rate))
+        if arrivals.clock.due(read + MS):
+            arrivals.clock.ask(read + MS)
+            if answers:
+                arrivals.clock.answered(read + MS, round((read + 2 * MS - begin) * rate))
     return arrivals, ages
+
+
+@given(way=st.floats(0.001, 0.02), rate=st.sampled_from([1.0, 0.99, 0.8, 2.0]))
+def test_by_pings_a_slow_vehicle_is_not_late_and_a_full_queue_is(way: float, rate: float) -> None:
+    """The answer to a PING is read where it stands in the queue, here one period after it was asked, or much later."""
+    for queue in (0, 30):  # messages that wait
+        arrivals, ages = Arrivals(), []
+        asked: list[tuple[int, int]] = []
+        for n in range(300):
+            stamp = 10_000 * (n + 1)
+            waiting = min(queue, max(n - 100, 0))
+            read = 50 * S + round((stamp + 10_000 * waiting) * 1000 / rate) + round(way * S)
+            ages.append(arrivals.judge(stamp, read).age)
+            arrivals.done(read + MS)
+            if asked and n >= asked[0][0]:
+                arrivals.echoed(asked.pop(0)[1])
+            if arrivals.clock.due(read + MS):
+                arrivals.clock.ask(read + MS)
+                arrivals.echo.ask(read + MS)
+                asked.append((n + 1 + waiting, read + MS))
+        assert max(ages[20:100]) < 0.04  # a period, the way, and the slow clock between two answers
+        assert ages[-1] == pytest.approx(0.01 * queue, abs=0.04)
 
 
 @given(way=st.floats(0.001, 0.3), rate=st.sampled_from([1.0, 1.00005, 0.9, 2.0, 0.5]))
@@ -109,6 +133,7 @@ def test_a_pause_of_the_vehicle_is_not_age() -> None:
         ages.append(arrivals.judge(stamp, read).age)
         arrivals.done(read + MS)
         if arrivals.clock.due(read + MS):
+            arrivals.clock.ask(read + MS)
             arrivals.clock.answered(read + MS, read + 2 * MS - begin)
     wait = round(2 * ASK_EVERY * 100)
     assert all(abs(age - 0.004) < 0.07 for age in ages[wait:])

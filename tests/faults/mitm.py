@@ -184,6 +184,15 @@ def delayed(seconds: float, *numbers: int, from_vehicle: bool = True) -> Fault:
     return fault
 
 
+def without(number: int, fault: Fault = nothing) -> Fault:
+    """`fault` on a link on which messages of this number never pass."""
+
+    def both(passing: Passing, now: float) -> Iterable[tuple[float, bytes]]:
+        return [] if passing.number == number else fault(passing, now)
+
+    return both
+
+
 def lost(*directions: bool) -> Fault:
     """Nothing passes in these directions: True from the vehicle, False to it."""
 

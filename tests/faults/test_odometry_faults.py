@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Link
-from mitm import Fault, delayed, frozen, lost, nothing, reset
+from mitm import TIMESYNC, Fault, delayed, frozen, lost, nothing, reset, without
 from rig import wait_for
 
 from models.record import read_record
@@ -147,6 +147,15 @@ def test_a_lost_link_means_the_autopilots_failsafe(hovering: Link, direction: tu
     wait_for(lambda: not hovering.middle.armed, "landed")
     # What the companion still sent against a dead link ended before the link was back.
     assert hovering.middle.silence(taken + 0.5) == 0.0
+
+
+def test_age_is_known_from_pings_alone(hovering: Link) -> None:
+    """PX4's answers to TIMESYNC do not come through MAVSDK."""
+    hovering.middle.fault = without(TIMESYNC)
+    time.sleep(2.0)
+    fresh = [tick.age for tick in hovering.companion.ticks[-50:]]
+    assert sorted(fresh)[25] < 0.03
+    ends(hovering, without(TIMESYNC, delayed(0.2)), "late")
 
 
 def test_age_stands_in_the_record(link: Link) -> None:

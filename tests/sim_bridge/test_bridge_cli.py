@@ -82,7 +82,7 @@ def test_fly_writes_a_record_and_seals_the_answer(tmp_path: Path) -> None:
     assert effect["name"] not in done.stdout + done.stderr
     before = (tmp_path / "one.sealed").read_bytes()
     again = command(*fly, "--hidden", "random", "--seed", "8", cwd=tmp_path)
-    assert again.returncode == 2 and "one.mcap: cannot write" in again.stderr
+    assert again.returncode == 2 and "one.mcap: is there already" in again.stderr
     assert (tmp_path / "one.sealed").read_bytes() == before
 
 
