@@ -268,6 +268,8 @@ class Link:
         what = f"companion '{name}'" if name else "companion"
         names = sorted({one.vehicle for one in _answers(self.session, "*", _LOOK)})
         others = f"; there are: {', '.join(names)}" if names else "; is it running, and listening there?"
+        if self.keys is not None and not names:
+            others = f"; is '{self.keys.certificate}' on its list (access.toml in the vehicle's keys)?"
         raise InputError(f"no {what} answers on {self._where}{others} (other endpoint: -e tcp/HOST:PORT)")
 
     def _signed(self, onnx: bytes) -> bytes | None:

@@ -335,7 +335,11 @@ def forged_publications(stage: Stage) -> str:
 
 @attack("a token, a queryable or ticks of an engineer reach no other ground station")
 def forged_by_a_colleague(stage: Stage) -> str:
-    session = stage.intruder("bob")
+    return "; ".join(filter(None, (_forged(stage, mode) for mode in ("peer", "client"))))
+
+
+def _forged(stage: Stage, mode: str) -> str:
+    session = stage.open({**tls(stage.keys("bob")), "mode": mode})
     asked: list[str] = []
     ticks: list[bytes] = []
     try:

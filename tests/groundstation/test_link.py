@@ -18,6 +18,7 @@ from companion.telemetry import PIECE, Telemetry, make_event, read_json
 from companion.zenoh_session import ZenohSettings, open_session
 from groundstation.cli import app
 from groundstation.link import Link, companions
+from groundstation.pilot_commands import warn
 from groundstation.settings import Settings, load_settings
 from models.errors import InputError, run_command_line
 from models.record_pb2 import Tick
@@ -269,3 +270,25 @@ def test_a_flight_is_asked_for_watched_fetched_and_tracked(processes, endpoint, 
     (row,) = json.loads(ground("flights", tmp_path / "got", "--json"))
     assert (row["trajectory"], row["controller"], row["error"]) == ("hover", "lqr", "")
     assert "hover lqr: finished" in ground("status", "-e", endpoint)
+
+
+def test_what_is_open_to_anybody_is_told_in_red(endpoint, tmp_path, capsys):
+    from groundstation.views.monitor import state
+
+    status = {
+        "accepted": True,
+        "access": {"keys": "", "exposed": ["listens on tcp/0.0.0.0:7447"], "loose": ""},
+        "phase": "idle",
+    }
+    telemetry = Telemetry(
+        open_session(ZenohSettings(listen=(endpoint,))), "quad5", {"status": lambda p, q: status}, tmp_path
+    )
+    try:
+        with link_to(endpoint) as link:
+            assert "insecure" in link.warning and "tcp/0.0.0.0:7447" in link.warning
+            page = state("quad5", Tick(phase="idle"), 0.0, {"insecure": link.warning})
+            assert "**INSECURE**" in page and "tcp/0.0.0.0:7447" in page
+            warn(link)
+            assert "anybody on the network can fly it" in capsys.readouterr().err
+    finally:
+        telemetry.close()
