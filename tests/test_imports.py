@@ -77,3 +77,27 @@ def test_a_light_process_loads_no_heavy_library(module: str) -> None:
     code = f"import sys, {module}; print(sorted({heavy!r} & set(sys.modules)))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert out.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "module", ["companion.inference", "companion.inspection", "groundstation.cli", "models.export"]
+)
+def test_onnxruntime_tells_nobody_of_what_it_runs(module: str) -> None:
+    """Its builds send events to their maker, unless told otherwise before they are loaded."""
+    import os
+    import subprocess
+
+    clean = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    code = (
+        "import sys\n"
+        "class Seen:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        import os\n"
+        "        if name == 'onnxruntime': print(os.environ.get('ORT_DISABLE_TELEMETRY'))\n"
+        "sys.meta_path.insert(0, Seen())\n"
+        f"import {module}\nimport onnxruntime\n"
+    )
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT, env=clean
+    )
+    assert out.stdout.split() == ["1"]
