@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import configparser
 import json
+import re
 import shutil
+import stat
 import subprocess
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from test_companion_cli import companion, refused
 
 from companion.service import CONFIG, FOLDER, SYSUSERS, UNIT
 from companion.settings import Settings, load_settings
+from groundstation.keys import make_keys
 
 
 def install(root: Path, *flags: object) -> dict[str, str]:
@@ -121,3 +124,50 @@ def test_what_cannot_be_installed_is_one_line(flags: list[object], message: str,
     line = refused("install-service", "--vehicle", VEHICLE, "--output", tmp_path, *flags)
     assert message in line
     assert list(tmp_path.iterdir()) == []
+
+
+def test_with_keys_it_is_open_to_the_network_and_nobody_else_reads_them(tmp_path: Path) -> None:
+    make_keys(tmp_path / "keys", ["quad5"], [("anna", "operator")])
+    root = tmp_path / "root"
+    install(root, "--keys", tmp_path / "keys" / "vehicle-quad5")
+    settings = load_settings(root / CONFIG)
+    assert settings.zenoh.listen == ("tls/0.0.0.0:7447",)
+    assert settings.keys == f"/{FOLDER}/keys"
+    there = root / FOLDER / "keys"
+    assert {path.name for path in there.iterdir()} == {"ca.pem", "cert.pem", "key.pem", "access.toml"}
+    assert {stat.S_IMODE(path.stat().st_mode) for path in there.iterdir()} == {0o600}
+    assert stat.S_IMODE(there.stat().st_mode) == 0o700
+    make_keys(tmp_path / "others", ["x500"])
+    line = refused(
+        "install-service",
+        "--vehicle",
+        VEHICLE,
+        "--output",
+        root,
+        "--keys",
+        tmp_path / "others" / "vehicle-x500",
+    )
+    assert "the vehicle file says 'quad5'" in line
+
+
+def test_open_to_the_network_without_keys_only_when_told_so(tmp_path: Path) -> None:
+    flags = ("--vehicle", VEHICLE, "--output", tmp_path, "--listen", "tcp/0.0.0.0:7447")
+    assert "--insecure" in refused("install-service", *flags)
+    assert not list(tmp_path.iterdir())
+    install(tmp_path, "--listen", "tcp/0.0.0.0:7447", "--insecure")
+    settings = load_settings(tmp_path / CONFIG).zenoh
+    assert settings.insecure and settings.listen == ("tcp/0.0.0.0:7447",)
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here")
+def test_systemd_finds_little_exposed(tmp_path: Path) -> None:
+    install(tmp_path)
+    told = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", tmp_path / UNIT], capture_output=True, text=True
+    )
+    found = re.search(r"exposure level for \S+: ([\d.]+)", told.stdout)
+    if found is None:
+        pytest.skip("this systemd-analyze does not judge files")
+    assert float(found.group(1)) <= 3.0
+    unit = (tmp_path / UNIT).read_text()
+    assert "LimitRTPRIO=" in unit and "RestrictRealtime" not in unit, "it flies at real-time priority"
