@@ -12,14 +12,11 @@ import json
 import math
 import os
 import random
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +33,7 @@ from models.reference import trajectory
 from models.trajectory import Segment, Trajectory, transfer
 from models.vehicle import GRAVITY, Vehicle, load_vehicle
 from models.whole_file import write_whole
+from models.workers import interrupts_held, worker_pool
 
 SHARES = {0: 0.3, 1: 0.4, 2: 0.2, 3: 0.1}
 """Share of the flights with so many effects hidden in them."""
@@ -396,25 +394,13 @@ def _each(study: Study, wanted: Sequence[Sortie], jobs: int) -> Iterator[Case]:
     # each worker uses one core; the variables are read when the workers' numpy is loaded
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    # a fresh interpreter each: forking a process that has threads (the progress bar's) may hang
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _serve_parent)
+    pool = worker_pool(jobs)
     try:
-        yield from (one.result() for one in as_completed([pool.submit(_work, study, s) for s in wanted]))
+        with interrupts_held():
+            begun = [pool.submit(_work, study, s) for s in wanted]
+        yield from (one.result() for one in as_completed(begun))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _serve_parent() -> None:
-    """Leave interrupts to the parent, and end when it does, however it does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = parent_process()
-    assert parent is not None
-
-    def end_with_it() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=end_with_it, daemon=True).start()
 
 
 def forget_diagnoses(study: Study) -> None:

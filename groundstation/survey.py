@@ -18,6 +18,7 @@ import numpy as np
 from scipy import stats
 
 from models.errors import InputError
+from models.outside import is_number
 from models.whole_file import is_hidden, whole_file
 
 VERDICTS = ("missing", "possible", "not_supported", "not_excited", "included")
@@ -359,9 +360,28 @@ def _trend(value: np.ndarray, group: np.ndarray, days: list[str]) -> tuple[float
 
 
 def row_from_table(table: dict[str, Any]) -> Row:
-    """A row as `asdict` and JSON wrote it."""
+    """A row as `asdict` and JSON wrote it. Raises `KeyError`, `TypeError` or `AttributeError` for any other table."""
     estimates = tuple(Estimate(**e) for e in table["estimates"])
-    return Row(**{**table, "estimates": estimates, "unexplained": tuple(table["unexplained"])})
+    row = Row(**{**table, "estimates": estimates, "unexplained": tuple(table["unexplained"])})
+    texts = (
+        row.file,
+        row.stamp,
+        row.day,
+        row.vehicle,
+        row.error,
+        *row.unexplained,
+        *row.verdicts,
+        *row.verdicts.values(),
+    )
+    numbers = [row.duration, row.seconds, *(n for e in estimates for n in (e.value, e.low, e.high))]
+    numbers += [n for n in (row.rms_before, row.rms_after, row.noise_floor) if n is not None]
+    if not all(
+        isinstance(t, str) for t in (*texts, *(t for e in estimates for t in (e.effect, e.parameter, e.unit)))
+    ):
+        raise TypeError("a text is none")
+    if not all(is_number(n) for n in numbers):
+        raise TypeError("a number is none")
+    return row
 
 
 def write_table(rows: Sequence[Row], path: Path) -> None:

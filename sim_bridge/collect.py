@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from models.database import Collection, Sortie, record_name
 from models.design import design_to_json
+from models.errors import InputError
 from models.record import vehicle_to_toml
+from models.workers import interrupts_held, worker_pool
 from sim_bridge.in_process import Flown, Plan, record
 from sim_bridge.truth.battery import BatteryState
 
@@ -71,15 +72,18 @@ def collect(
     missing = [flight for flight in wanted if flight.name not in collection.flown]
     if not missing:
         return
-    # A fresh interpreter each: forking a process that has threads (the progress bar's) may hang.
-    pool = ProcessPoolExecutor(
-        max(1, min(jobs, len(missing))), get_context("spawn"), _leave_interrupts_to_parent
-    )
-    under_way = {pool.submit(_fly, flight, collection.folder): flight for flight in missing}
+    pool = worker_pool(max(1, min(jobs, len(missing))))
+    with interrupts_held():
+        under_way = {pool.submit(_fly, flight, collection.folder): flight for flight in missing}
     try:
         for done in as_completed(list(under_way)):
             flight = under_way.pop(done)
             yield flight, _kept(collection, flight, done.result())
+    except BrokenProcessPool:
+        raise InputError(
+            f"{collection.folder}: a process was ended from outside (out of memory?); the same command continues, with "
+            "fewer --jobs if need be"
+        ) from None
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         for late, flight in under_way.items():
@@ -87,20 +91,11 @@ def collect(
                 _kept(collection, flight, late.result())
 
 
-def _leave_interrupts_to_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def _fly(flight: Flight, folder: Path) -> Flown:
     """Fly one into its record, which has its name only when it is whole."""
-    partial = folder / f".{flight.name}.part"
-    partial.unlink(missing_ok=True)
-    try:
-        flown = record(flight.plan, partial)
-        partial.replace(folder / flight.name)
-    finally:
-        partial.unlink(missing_ok=True)
-    return flown
+    target = folder / flight.name
+    target.unlink(missing_ok=True)  # of a run that was killed before it could enter the record
+    return record(flight.plan, target)
 
 
 def _kept(collection: Collection, flight: Flight, flown: Flown) -> dict[str, Any]:

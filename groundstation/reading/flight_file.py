@@ -102,7 +102,8 @@ def assemble(
     take. Raises `InputError` for anything that cannot be analysed."""
     origin = str(path)
     _check_groups(origin, columns)
-    said = list(notes)
+    columns, dead = plausible.without_dead_battery(columns)
+    said = [*notes, *dead]
     names = list(columns)
     every = {
         **plausible.without_empty_attitude(columns),

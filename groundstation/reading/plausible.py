@@ -182,6 +182,19 @@ def without_empty_attitude(columns: dict[str, np.ndarray]) -> dict[str, np.ndarr
     return {**columns, "quaternion": np.where(empty[:, None], np.nan, q)}
 
 
+def without_dead_battery(columns: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """A voltage of zero or less is none: whoever flies has one. Told in a note; all of them: no voltage at all."""
+    volts = columns.get("battery_voltage")
+    if volts is None or not np.any(dead := volts <= 0.0):
+        return columns, []
+    if np.all(dead | ~np.isfinite(volts)):
+        return {k: v for k, v in columns.items() if k != "battery_voltage"}, [
+            "no battery voltage is above 0 V: left out"
+        ]
+    note = f"{int(dead.sum())} battery voltages of 0 V or less count as missing"
+    return {**columns, "battery_voltage": np.where(dead, np.nan, volts)}, [note]
+
+
 def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -> None:
     """Magnitudes that tell a wrong unit: degrees, g, millivolts, raw 16-bit commands."""
     if (q := columns.get("quaternion")) is not None:

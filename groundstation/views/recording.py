@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from models.errors import InputError
 from models.whole_file import whole_file
 
-_END = b"RRF2FOOT"
-"""A recording of Rerun 0.41 ends with this and four bytes."""
 TIME = "flight_time"
 """The timeline of everything that happened in a flight: s on the flight's clock."""
 MOST_POINTS = 4000
@@ -29,22 +26,13 @@ def recording(path: Path, kind: str, name: str) -> Iterator[rr.RecordingStream]:
     """
     with whole_file(path, "the recording", "choose another --save") as partial:
         stream = rr.RecordingStream(f"trueflight {kind}")
-        try:
-            stream.save(partial)
-            stream.send_recording_name(name)
-            yield stream
-        finally:
-            # The writer is a thread of Rerun's own, which tells of a full disk in a log alone; the end of the file
-            # tells whether it came to it.
-            with suppress(RuntimeError):
-                stream.flush()
-            stream.disconnect()
-        with partial.open("rb") as file:
-            file.seek(max(0, partial.stat().st_size - len(_END) - 4))
-            if not file.read().startswith(_END):
-                raise InputError(
-                    f"{path}: cannot write all of the recording; free space, or choose another --save"
-                )
+        # Into memory, and from there to the disk: Rerun's own writer tells of a full disk in a log alone, and then a
+        # flush never returns.
+        content = stream.binary_stream()
+        stream.send_recording_name(name)
+        yield stream
+        partial.write_bytes(content.read() or b"")
+        stream.disconnect()
 
 
 def between(start: float, end: float) -> rr.TimeRange:
