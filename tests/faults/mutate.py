@@ -18,7 +18,7 @@ import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -72,6 +72,7 @@ def run(
     seed: int,
     progress: Callable[[int, int], None] = lambda done, failed: None,
     only: str = "",
+    without: Sequence[str] = (),
     keep: Path | None = None,
     figures: Figures | None = None,
 ) -> list[Failure]:
@@ -81,7 +82,7 @@ def run(
     failures: list[Failure] = []
     with tempfile.TemporaryDirectory(prefix="mutated-") as name, _limits():
         folder = Path(name)
-        chosen = [reader for reader in readers(folder) if only in reader.name]
+        chosen = [reader for reader in readers(folder) if only in reader.name and reader.name not in without]
         weights = [reader.weight for reader in chosen]
         for number in range(count):
             draw = random.Random(f"{seed} {number}")
@@ -171,6 +172,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=3000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="readers whose name holds this text")
+    parser.add_argument("--without", action="append", default=[], help="a reader to leave out")
     parser.add_argument("--keep", type=Path, default=None, help="folder for the files that failed")
     asked = parser.parse_args()
     figures = Figures()
@@ -179,7 +181,7 @@ def main() -> int:
         if done % 1000 == 0:
             print(f"{done} of {asked.count} files, {failed} failures", file=sys.stderr, flush=True)  # noqa: T201
 
-    failures = run(asked.count, asked.seed, progress, asked.only, asked.keep, figures)
+    failures = run(asked.count, asked.seed, progress, asked.only, asked.without, asked.keep, figures)
     kinds = collections.Counter((f.reader, f.what, f.where.rsplit("\n", 2)[0][-200:]) for f in failures)
     for (reader, what, _), times in kinds.most_common():
         first = next(f for f in failures if (f.reader, f.what) == (reader, what))
