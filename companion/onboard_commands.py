@@ -77,6 +77,7 @@ def preflight_command(
     from models.vehicle import load_vehicle
 
     settings = _settings(config, vehicle, connect, rate, timeout, records)
+    settings.check_address()
     believed = load_vehicle(settings.vehicle) if settings.vehicle else None
     link = VehicleLink(settings.connect, settings.timeout, settings.system)
     changed: list[str] = []

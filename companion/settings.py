@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -65,11 +66,21 @@ class Settings:
             raise InputError(f"timeout = {self.timeout:g} is outside 0.1 to 600 s")
         if not 0 <= self.realtime <= 80:
             raise InputError(f"realtime = {self.realtime} is outside 0 (off) to 80")
+        self.check_address()
         self.pose.checked()
         self.check_signing()
         if not self.vehicle:
             raise InputError("no vehicle file; pass --vehicle FILE or set 'vehicle' in the configuration")
         return self
+
+    def check_address(self) -> None:
+        """Raise `InputError` for a serial address without its baud rate: the one taken then is too slow to fly with."""
+        if self.connect.startswith("serial") and not re.fullmatch(
+            r"serial\w*://[^:]+:[0-9]{4,8}", self.connect
+        ):
+            raise InputError(
+                f"{self.connect}: no baud rate in it; write serial:///dev/ttyAMA0:921600 (device, colon, baud rate)"
+            )
 
     def check_signing(self) -> None:
         """Raise `InputError` for an `unsigned_models` without sense."""

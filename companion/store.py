@@ -41,7 +41,7 @@ def live_file(folder: Path) -> Path | None:
 def _names_of(folder: Path) -> list[str]:
     try:
         return [str(name) for name in json.loads((folder / _HISTORY).read_text(encoding="utf-8"))]
-    except (OSError, ValueError, TypeError):
+    except (OSError, ValueError, TypeError, RecursionError):
         return []
 
 

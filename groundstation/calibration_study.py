@@ -29,6 +29,7 @@ from models.database import database
 from models.design import load_design
 from models.effects import catalogue
 from models.errors import InputError
+from models.outside import json_object, read_text
 from models.reference import trajectory
 from models.trajectory import Segment, Trajectory, transfer
 from models.vehicle import GRAVITY, Vehicle, load_vehicle
@@ -112,7 +113,7 @@ class Study:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if index.exists() and any(self.folder.glob("*.flight.json")):
-                self._same(json.loads(index.read_text(encoding="utf-8")), index)
+                self._same(_read(index), index)
             elif not index.exists() and any(self.folder.iterdir()):
                 raise InputError(f"{self.folder}: holds files that are no study's; choose another --output")
             else:
@@ -313,8 +314,8 @@ def fly(study: Study, sortie: Sortie) -> dict[str, Any]:
     stem = study.folder / sortie.name
     kept = stem.with_suffix(".flight.json")
     if kept.exists():
-        told: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
-        if told["sortie"] != json.loads(json.dumps(asdict(sortie))):
+        told = _read(kept)
+        if told.get("sortie") != json.loads(json.dumps(asdict(sortie))):
             raise InputError(f"{kept}: was flown for another study; choose another --output")
         return told
     vehicle = load_vehicle(study.vehicle)
@@ -345,7 +346,7 @@ def diagnose_record(study: Study, sortie: Sortie) -> dict[str, Any]:
 
     kept = (study.folder / sortie.name).with_suffix(".diagnosis.json")
     if kept.exists():
-        told: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
+        told = _read(kept)
         return told
     begin = time.perf_counter()
     try:
@@ -407,6 +408,11 @@ def forget_diagnoses(study: Study) -> None:
     """Let every flight be diagnosed anew; the flights stay."""
     for path in study.folder.glob("*.diagnosis.json"):
         path.unlink()
+
+
+def _read(path: Path) -> dict[str, Any]:
+    advice = "remove it, and the same command goes on"
+    return json_object(read_text(path, "the study", advice), str(path), advice)
 
 
 def _write(path: Path, text: str) -> None:

@@ -116,6 +116,17 @@ def test_a_byte_order_mark_is_read_and_numbers_beyond_64_bits_are_not(tmp_path: 
             json_object(text, "x", "correct it")
 
 
+@pytest.mark.parametrize(
+    "address", ["serial:///dev/ttyACM0", "serial:///dev/ttyACM0:", "serial:///dev/ttyACM0:fast"]
+)
+def test_a_serial_address_without_baud_rate_shows_the_right_form(address: str) -> None:
+    for command in (["run"], ["preflight"]):
+        words = [BIN / "companion", *command, "--vehicle", QUAD5 / "vehicle.toml", "--connect", address]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 2 and "serial:///dev/ttyAMA0:921600" in done.stderr, done.stderr
+        assert len(done.stderr.splitlines()) == 1
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_collection_leaves_no_workers_behind_and_goes_on(how: signal.Signals, tmp_path: Path) -> None:
     words = [
@@ -168,3 +179,28 @@ def _command(pid: int) -> str:
 
 def _alive(pid: int) -> bool:
     return bool(_command(pid))
+
+
+@pytest.mark.parametrize("left", ["", '{"seed": 1, "scen', "[1]"])
+def test_a_reproduction_goes_on_after_a_kill(left: str, tmp_path: Path) -> None:
+    """An older version left half a file; this one a hidden one, or a record that nothing was told of yet."""
+    from groundstation.reproduce import Flown, _kept
+    from groundstation.reproduce_commands import _same_study
+
+    flown = Flown(1, "unseen", "lqr", (1.0, 2.0, 3.0), "finished", "")
+    (tmp_path / "study.json").write_text("")
+    (tmp_path / ".study.json.12345678.part").mkdir()
+    _same_study(tmp_path, {"minutes": 5.0})
+    _same_study(tmp_path, {"minutes": 5.0})
+    with pytest.raises(InputError, match="another study"):
+        _same_study(tmp_path, {"minutes": 6.0})
+    path = tmp_path / "unseen-lqr"
+    path.with_name("unseen-lqr.json").write_text(left)
+    path.with_name("unseen-lqr.mcap").write_bytes(b"half a record")
+
+    def fly(at: Path) -> Flown:
+        assert not at.with_name(f"{at.name}.mcap").exists()
+        return flown
+
+    assert _kept(path, fly) == flown
+    assert _kept(path, lambda at: pytest.fail("flown again")) == flown
