@@ -105,7 +105,7 @@ class Companion:
             session,
             vehicle.name,
             {
-                "status": lambda payload, parameters: {**self.director.status(), "access": self.access},
+                "status": lambda payload, parameters: self._status(),
                 "mission": lambda payload, parameters: self.director.request(read_json(payload)),
                 "model": self._model,
             },
@@ -207,6 +207,12 @@ class Companion:
         if self._errors_told <= 5:
             self.emit("warning", "malformed_message", text)
 
+    def _status(self) -> dict[str, Any]:
+        """What the companion does, and who may make it do something else."""
+        status = self.director.status()
+        signers = {entry["hash"]: self._signatures.signer(entry["hash"]) for entry in status["models"]}
+        return {**status, "access": {**self.access, "signers": signers}}
+
     def _model(self, payload: bytes, parameters: dict[str, str]) -> dict[str, Any]:
         if payload[:1] != b"{":
             signature = parameters.get(ATTACHED, "").encode()
@@ -214,6 +220,9 @@ class Companion:
             if reason:
                 self.emit("warning", "model_refused", f"{model_hash(payload)}: {reason}")
                 return {"accepted": False, "reason": reason}
+            if signature:
+                name = model_hash(payload)
+                self.emit("info", "model_signed", f"{name}: {self._signatures.told(name)}")
             shadow = parameters.get("shadow")
             try:
                 return self.director.deploy(payload, float(shadow) if shadow is not None else None)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+from datetime import UTC, datetime
 from pathlib import Path
 
 from models.access import ENGINEER, Keys
@@ -90,6 +91,15 @@ class Signatures:
             return read_signature((self._folder / f"{name}.sig").read_bytes()).signer
         except (OSError, InputError):
             return ""
+
+    def told(self, name: str) -> str:
+        """Who signed the model of this hash and when by their clock, for people."""
+        try:
+            signature = read_signature((self._folder / f"{name}.sig").read_bytes())
+        except (OSError, InputError):
+            return "its signature is of nobody known here"
+        when = datetime.fromtimestamp(1e-9 * signature.time_ns, UTC)
+        return f"signed by {signature.signer} at {when:%Y-%m-%d %H:%M:%S} UTC for '{signature.vehicle}'"
 
     def sweep(self) -> None:
         """Forget the signatures of models that are gone."""

@@ -477,6 +477,8 @@ def status_command(
     titles = {
         entry["hash"]: f"{entry['hash']} ({entry['name']} {entry['version']})" for entry in status["models"]
     }
+    for model, signer in status.get("access", {}).get("signers", {}).items():
+        titles[model] = f"{titles.get(model, model)}, {f'signed by {signer}' if signer else 'not signed'}"
     shadow, staged = status["shadow"], status["staged"]
     waiting = ""
     if shadow:

@@ -84,10 +84,18 @@ def read_keys(folder: str | Path) -> Keys:
             raise InputError(
                 f"keys '{folder}': cannot read {name} ({error.strerror}); pass a folder of `groundstation keys`"
             ) from None
-        if name == PRIVATE_KEY and stat.S_IMODE(mode) & 0o077:
-            raise InputError(f"{path}: others may read this private key; chmod 600 {path}")
+        if name == PRIVATE_KEY:
+            _check_private(path, mode)
+    signing = folder / SIGNING_KEY
+    if signing.exists():
+        _check_private(signing, signing.stat().st_mode)
     path = folder / ACCESS
     return _keys(folder, read_toml(path, "the list of who is let in"), str(path))
+
+
+def _check_private(path: Path, mode: int) -> None:
+    if stat.S_IMODE(mode) & 0o077:
+        raise InputError(f"{path}: others may read this private key; chmod 600 {path}")
 
 
 def _keys(folder: Path, table: dict[str, Any], where: str) -> Keys:

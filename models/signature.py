@@ -54,7 +54,7 @@ def read_signature(data: bytes) -> Signature:
     if not isinstance(table, dict) or sorted(table) != sorted(_FIELDS):
         raise InputError("its signature is no JSON object with " + ", ".join(_FIELDS))
     texts = all(isinstance(table[key], str) for key in _FIELDS if key != "time_ns")
-    if not texts or type(table["time_ns"]) is not int or not 0 < table["time_ns"] < 2**63:
+    if not texts or type(table["time_ns"]) is not int or not 0 < table["time_ns"] < 2**62:
         raise InputError("its signature holds values of another type")
     if not re.fullmatch(r"[0-9a-f]{64}", table["hash"]) or not re.fullmatch(
         r"[0-9a-f]{128}", table["signature"]

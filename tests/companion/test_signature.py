@@ -143,6 +143,7 @@ def test_a_companion_with_keys_is_read_flown_and_given_models_by_role(root: Path
                 with link("bob") as bob:
                     if start:
                         assert bob.status()["live"] == model_hash(onnx), "checked again and live"
+                        assert bob.status()["access"]["signers"] == {model_hash(onnx): "bob"}
                     else:
                         with pytest.raises(InputError, match="it is not signed"):
                             bob.request("model", onnx, 60.0)

@@ -1,6 +1,7 @@
 """The ground's end of Zenoh, on real sessions over loopback: requests, refusals, records, ticks, a whole
 flight."""
 
+import contextlib
 import json
 import os
 import queue
@@ -292,3 +293,33 @@ def test_what_is_open_to_anybody_is_told_in_red(endpoint, tmp_path, capsys):
             assert "anybody on the network can fly it" in capsys.readouterr().err
     finally:
         telemetry.close()
+
+
+def test_a_companion_that_was_started_again_is_followed_and_obeys(endpoint, tmp_path):
+    def serve():
+        asked = []
+        telemetry = Telemetry(
+            open_session(ZenohSettings(listen=(endpoint,))),
+            "quad5",
+            {
+                "status": lambda payload, parameters: {"accepted": True, "phase": "idle"},
+                "mission": lambda payload, parameters: asked.append(payload) or {"accepted": True},
+            },
+            tmp_path,
+        )
+        return telemetry, asked
+
+    first, _ = serve()
+    with link_to(endpoint) as link:
+        before = link.instance
+        first.close()
+        second, asked = serve()
+        try:
+            end = time.monotonic() + 30
+            while link.instance == before and time.monotonic() < end:
+                with contextlib.suppress(InputError):  # until Zenoh has connected again
+                    link.status()
+            assert link.instance != before
+            assert link.request("mission", {"trajectory": "hover"})["accepted"] and len(asked) == 1
+        finally:
+            second.close()
