@@ -454,4 +454,6 @@ def _nobody(where: str, error: Exception, keys: Keys | None) -> str:
         )
     else:
         advice = "start the companion, or pass its endpoint with -e (one that has keys wants --keys FOLDER and tls/...)"
+    if ", " in where:  # all must be there: the one that is missing may be the one that is meant
+        return f"not all of {where} answer ({told}); leave out what is switched off, or {advice}"
     return f"nobody answers on {where} ({told}); {advice}"

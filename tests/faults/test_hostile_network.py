@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hostile_network import ATTACKS, Attack, Stage
+from hostile_network import ATTACKS, Attack
+from network_stage import Stage
 
 
 @pytest.fixture(scope="module")
