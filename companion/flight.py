@@ -194,6 +194,8 @@ class Flight:
     _leg_begin: float = 0.0
     _now: float = 0.0
     _previous: Odometry | None = None
+    _heard_again: int = 0
+    """Time of the vehicle's (µs) at which odometry came again after a gap."""
     _low_since: float = math.inf
     _tumbled_since: float = math.inf
     _late_since: float = math.inf
@@ -227,7 +229,7 @@ class Flight:
                 self._legs.clear()
                 self._leg, self.wants_land, self._handed_over = None, False, False
                 self._low_since = self._tumbled_since = self._late_since = math.inf
-                self._turned, self._reset = 0.0, None
+                self._turned, self._reset, self._heard_again = 0.0, None, 0
 
         self._orders.append(order)
 
@@ -365,6 +367,8 @@ class Flight:
         if previous is not None:
             interval = 1e-6 * (odometry.vehicle_time_us - previous.vehicle_time_us)
         self._now = 1e-6 * odometry.vehicle_time_us
+        if interval / (1 + odometry.overtaken) > self.safety.odometry_gap:
+            self._heard_again = odometry.vehicle_time_us
         w, x, y, z = odometry.quaternion
         self._yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         if self._leg is not None and previous is not None:
@@ -397,8 +401,9 @@ class Flight:
             out.phase = self.phase
             return out
         told = latest.mode_time_us
-        if told is not None and odometry.vehicle_time_us - told > 1e6 * _MODE_UNKNOWN:
-            return out  # somebody else may fly by now
+        since = max(odometry.vehicle_time_us - round(1e6 * _MODE_UNKNOWN), self._heard_again)
+        if told is not None and told < since:
+            return out  # somebody else may fly by now, also where nothing was heard for a while
         out.reference = self._reference(position, odometry)
         out.phase = self.phase
         guard = mission.guard

@@ -63,6 +63,17 @@ def test_nothing_is_sent_while_nobody_tells_the_mode() -> None:
     assert rig.flight.phase == MISSION
 
 
+def test_after_a_lost_link_nothing_is_sent_before_the_mode_is_told() -> None:
+    """The autopilot has long taken over, and its odometry may be back sooner than its mode."""
+    rig = hovering()
+    rig.latest.mode_time_us = rig.time_us
+    assert rig.tick(600_000).step is None
+    assert all(out.step is None for out in rig.run(0.3))
+    assert ("odometry_gap", "odometry was missing for 0.60 s: landing here") in rig.events
+    rig.latest.mode_time_us = rig.time_us
+    assert rig.tick().step is not None, "it is in Offboard still, and lands"
+
+
 def test_odometry_that_stands_still_ends_the_flight() -> None:
     rig = hovering()
     rig.still = True
