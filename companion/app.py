@@ -12,18 +12,19 @@ from typing import Any
 from companion.control import ControlLaw
 from companion.director import Director
 from companion.flight import IDLE, Flight
+from companion.mission_request import SMALL, read_json, read_request
 from companion.pose import PoseFeed
 from companion.settings import Settings
 from companion.signature import Signatures
 from companion.store import ModelStore
-from companion.telemetry import ATTACHED, Telemetry, make_event, read_json
+from companion.telemetry import ATTACHED, Telemetry, make_event
 from companion.tick import make_tick
 from companion.vehicle_link import Odometry, VehicleLink
 from companion.watchdog import Watchdog, raise_priority
 from companion.zenoh_session import INSECURE, open_planned, plan_session
 from models.contract import model_hash
 from models.design import load_design
-from models.errors import InputError
+from models.errors import InputError, shown
 from models.vehicle import load_vehicle
 
 _M_ARENA_MAX = -8  # malloc.h
@@ -106,7 +107,7 @@ class Companion:
             vehicle.name,
             {
                 "status": lambda payload, parameters: self._status(),
-                "mission": lambda payload, parameters: self.director.request(read_json(payload)),
+                "mission": lambda payload, parameters: self.director.request(read_request(payload)),
                 "model": self._model,
             },
             records,
@@ -116,7 +117,7 @@ class Companion:
             self.pose = PoseFeed(settings.pose, self.link.send_pose, self.emit)
             self.director.pose = self.pose
             self.link.share_clock()
-            self.telemetry.subscribe("pose", self.pose.take)
+            self.telemetry.subscribe("pose", self.pose.take, self.pose.refuse_size)
         if plan.exposed:
             self.emit("error", "insecure", f"{INSECURE}; it {' and '.join(plan.exposed)}")
         for reason in store.refused_at_start:
@@ -211,9 +212,16 @@ class Companion:
         """What the companion does, and who may make it do something else."""
         status = self.director.status()
         signers = {entry["hash"]: self._signatures.signer(entry["hash"]) for entry in status["models"]}
-        return {**status, "access": {**self.access, "signers": signers}}
+        return {
+            **status,
+            "access": {**self.access, "signers": signers},
+            "requests_refused": self.telemetry.refused,
+        }
 
     def _model(self, payload: bytes, parameters: dict[str, str]) -> dict[str, Any]:
+        for name in parameters:
+            if name not in ("shadow", ATTACHED):
+                raise InputError(f"unknown parameter {shown(name)} of a model; known: shadow")
         if payload[:1] != b"{":
             signature = parameters.get(ATTACHED, "").encode()
             reason = self._signatures.admit(payload, signature)
@@ -227,7 +235,9 @@ class Companion:
             try:
                 return self.director.deploy(payload, float(shadow) if shadow is not None else None)
             except ValueError:
-                return {"accepted": False, "reason": f"shadow = {shadow!r} is not a number of seconds"}
+                return {"accepted": False, "reason": f"shadow = {shown(shadow)} is not a number of seconds"}
+        if len(payload) > SMALL:
+            raise InputError("no ONNX file, and too long for a command; send list, rollback or an ONNX file")
         command = read_json(payload).get("command")
         if command == "list":
             return {"accepted": True, "reason": "", **self.director.store.describe()}
@@ -235,7 +245,7 @@ class Companion:
             return self.director.roll_back()
         return {
             "accepted": False,
-            "reason": f"unknown command {command!r}; send list, rollback or an ONNX file",
+            "reason": f"unknown command {shown(command)}; send list, rollback or an ONNX file",
         }
 
     def _settle_rates(self, rate: float) -> None:

@@ -20,6 +20,7 @@ from typing import Any
 from companion.flight import IDLE, LANDING, MISSION, SILENT, TAKEOFF, Decision, Flight, Mission, Safety
 from companion.guard import Guard
 from companion.message_rates import link_too_slow, odometry_too_low
+from companion.mission_request import mission_request
 from companion.pose import PoseFeed
 from companion.shadow import Shadow, ShadowLimits
 from companion.store import ModelStore
@@ -27,9 +28,9 @@ from companion.vehicle_link import Rates, VehicleLink
 from companion.watch import GuardLimits
 from models.contract import CORRECTED
 from models.design import Design
-from models.errors import InputError
+from models.errors import InputError, shown
 from models.record import FlightRecorder
-from models.reference import KINDS, Trajectory, trajectory, trajectory_from_csv
+from models.reference import Trajectory
 from models.vehicle import Vehicle
 
 QUEUE_LIMIT = 16
@@ -45,7 +46,6 @@ _ORDER_TIMEOUT = 0.2  # s for the next tick
 _LEAST_MODE_RATE = 0.4  # Hz: PX4 1.14 gives 1 whatever is asked for (HEARTBEAT alone), later ones 3
 _MODE_MEASURED = 1.5  # s of measuring below which so rare a message may well be missing
 _SHADOW_SECONDS = (0.5, 600.0)
-_MISSION_KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
 
 
 @dataclass
@@ -86,6 +86,8 @@ class Director:
     _deploying: threading.RLock = field(default_factory=threading.RLock)
     """Held where what is live and whether a flight is under way must not change apart."""
     _number: int = 0
+    _seconds: dict[str, float] = field(default_factory=dict)
+    """How long the models from the ground are to be in the shadow."""
 
     # Asked by the ground, on the service thread
 
@@ -93,16 +95,17 @@ class Director:
         """A mission or a command; never raises for what the ground sends."""
         try:
             if "command" in request:
-                return self._command(str(request["command"]))
+                return self._command(request["command"])
             return self._mission(request)
         except InputError as error:
             return {"accepted": False, "reason": str(error)}
 
     def deploy(self, onnx: bytes, shadow: float | None = None) -> dict[str, Any]:
-        """Check a model; make it live on the ground, or let it prove itself for `shadow` s in flight.
+        """Check a model, and let it prove itself for `shadow` s: in this flight, or before the next corrected mission.
 
-        Blocks for the check, which has a process of its own. The answer's `state` is `live` or `shadow`; what
-        became of a model in the shadow is told by events and the status.
+        Blocks for the check, which has a process of its own. The answer's `state` is `shadow` in flight, `staged` on
+        the ground, and `live` for a model that has proved itself in an earlier flight; what became of a model in the
+        shadow is told by events and the status.
         """
         candidate = self.flight.candidate
         if candidate is not None:
@@ -118,7 +121,7 @@ class Director:
         name, title = finding.info.hash, f"{finding.info.hash} ({finding.reason})"
         with self._deploying:
             if self.flight.phase == IDLE:
-                return self._make_live(name, title, finding.reason)
+                return self._on_the_ground(name, title, finding.reason, shadow)
         if name == self.store.live_name:
             self.store.discard(name)
             return {
@@ -145,6 +148,13 @@ class Director:
             )
             return {"accepted": True, "reason": reason, **self.store.describe()}
         with self._deploying:
+            staged = self.store.staged_name
+            if staged and self.flight.phase == IDLE:
+                title = self.store.title(staged)
+                self.store.discard(staged)
+                reason = f"{title} is withdrawn before its first flight; live stays {self.store.live_name or 'none'}"
+                self.emit("info", "model_rolled_back", f"by command: {reason}")
+                return {"accepted": True, "reason": reason, **self.store.describe()}
             earlier = self.store.previous_name
             try:
                 earlier_model = self.store.open(earlier) if earlier and self.flight.phase != IDLE else None
@@ -249,9 +259,9 @@ class Director:
             return link_too_slow(what)
         return ""
 
-    def _command(self, command: str) -> dict[str, Any]:
+    def _command(self, command: object) -> dict[str, Any]:
         if command not in ("abort", "land"):
-            return {"accepted": False, "reason": f"unknown command '{command}'; use abort or land"}
+            return {"accepted": False, "reason": f"unknown command {shown(command)}; use abort or land"}
         waiting = self._drop_queue(f"{command} from the ground")
         if self.flight.phase == IDLE:
             done = f"{waiting} queued missions dropped; nothing is flying"
@@ -260,21 +270,15 @@ class Director:
         return {"accepted": True, "reason": "landing at home" if command == "land" else "landing where it is"}
 
     def _mission(self, request: dict[str, Any]) -> dict[str, Any]:
-        for key in request:
-            if key not in _MISSION_KEYS:
-                raise InputError(f"unknown key '{key}' in the mission; known: {', '.join(_MISSION_KEYS)}")
-        path = _trajectory(request)
+        asked = mission_request(request)
+        path, controller, repeat = asked.path, asked.controller, asked.repeat
         reason = self.safety.check_trajectory(path)
         if reason:
             raise InputError(f"trajectory '{path.name}': {reason}")
-        repeat = request.get("repeat", 1)
-        if type(repeat) is not int or not 1 <= repeat <= 100:
-            raise InputError(f"repeat must be a whole number from 1 to 100, not {repeat!r}")
         if self.stopping.is_set():
             raise InputError("the companion is shutting down")
         if self.flight.phase == IDLE and self.not_ready():
             raise InputError(self.not_ready())
-        controller = str(request.get("controller", "lqr"))
         with self._lock:
             if len(self._queue) >= QUEUE_LIMIT:
                 raise InputError(f"{QUEUE_LIMIT} missions are waiting already")
@@ -298,15 +302,16 @@ class Director:
         return Mission(identity, path, controller, repeat, guard)
 
     def _guard(self) -> Guard | None:
-        """A guard around the live model; None without one."""
+        """A guard around the live model, or around none where one is staged; None where there is neither."""
         model = self.store.live
-        if model is None:
+        if model is None and not self.store.staged_name:
             return None
 
         def tripped(name: str, reason: str) -> None:
             self.emit("warning", "guard_trip", f"correction {name} switched off: {reason}")
 
-        return Guard(model.watched(self.guard_limits), tripped)
+        watch = model.watched(self.guard_limits) if model is not None else None
+        return Guard(watch, tripped, self.guard_limits)
 
     def _try(self, name: str, seconds: float | None = None) -> str:
         """Put the staged model into the shadow of the flight; '' or why not."""
@@ -315,21 +320,32 @@ class Director:
         except InputError as error:
             self.store.discard(name)
             return str(error)
-        shadow = Shadow(watch, self.shadow_limits, self.store.title(name), seconds or 0.0)
+        seconds = seconds or self._seconds.get(name, 0.0)
+        shadow = Shadow(watch, self.shadow_limits, self.store.title(name), seconds)
         self.flight.try_model(shadow)
         # The next tick takes it over; an answer before that would describe the state of before.
         self._wait(lambda: self.flight.candidate is shadow, _ORDER_TIMEOUT)
         return ""
 
-    def _make_live(self, name: str, title: str, reason: str) -> dict[str, Any]:
-        """The staged model becomes live on the ground."""
+    def _on_the_ground(self, name: str, title: str, reason: str, seconds: float | None) -> dict[str, Any]:
+        """The staged model waits for its first flight; one that proved itself in an earlier flight is live at once."""
+        if not self.store.proved(name):
+            self._seconds[name] = seconds or self.shadow_limits.seconds
+            told = f"it flies its first {self._seconds[name]:g} s of the next corrected flight in the shadow"
+            self.emit("info", "model_staged", f"{title}: accepted by its check; {told}")
+            return {
+                "accepted": True,
+                "state": "staged",
+                "reason": f"{reason}; {told}",
+                **self.store.describe(),
+            }
         failed = self.store.commit(name)
         if failed:
             self.store.discard(name)
             self.emit("warning", "model_refused", f"{title}: {failed}")
             return {"accepted": False, "reason": failed}
         self.flight.live = self.store.live_name
-        self.emit("info", "model_live", f"{title} is live")
+        self.emit("info", "model_live", f"{title} is live: it has proved itself in an earlier flight")
         return {"accepted": True, "state": "live", "reason": reason, **self.store.describe()}
 
     def _settle(self) -> None:
@@ -347,15 +363,11 @@ class Director:
             failed = store.withdraw(name)
         elif decision.kind == "refused":
             store.discard(name)
-        elif self.flight.mission is not None and self.flight.mission.guard is None:
-            # Nothing was corrected in that flight, so that this is a deployment on the ground like any other.
-            self._make_live(name, store.title(name), "")
         else:
             self.emit(
                 "warning",
                 "model_staged",
-                f"{store.title(name)}: landed before it proved itself; the next corrected flight goes on with "
-                "it, and deployed again on the ground it is live at once",
+                f"{store.title(name)}: landed before it proved itself; the next flight goes on with it",
             )
         if failed:
             self.emit("warning", "model_not_kept", f"{store.title(name)}: {failed}")
@@ -409,7 +421,9 @@ class Director:
         guard = self._guard()
         if guard is None:
             return "no model is live any more; deploy one"
-        progress.mission = replace(progress.mission, guard=guard)
+        staged = self.store.staged_name
+        proving = self._seconds.get(staged, self.shadow_limits.seconds) if staged else 0.0
+        progress.mission = replace(progress.mission, guard=guard, proving=proving)
         return ""
 
     def _check(self) -> str:
@@ -516,7 +530,7 @@ class Director:
             "mission": mission.identity,
             "trajectory": mission.trajectory.name,
             "controller": mission.controller,
-            "model": mission.guard.live if mission.guard is not None else "",
+            "model": (mission.guard.live or self.store.staged_name) if mission.guard is not None else "",
             "repeat": str(mission.repeat),
             **{f"parameter.{key}": str(value) for key, value in mission.trajectory.parameters.items()},
         }
@@ -534,16 +548,3 @@ class Director:
         if recorder.dropped or recorder.error:
             text = recorder.error or f"{recorder.dropped} messages missing in {recorder.path.name}"
             self.emit("warning", "record_incomplete", text)
-
-
-def _trajectory(request: dict[str, Any]) -> Trajectory:
-    if "setpoints" in request:
-        if "trajectory" in request:
-            raise InputError("give either a trajectory or setpoints, not both")
-        return trajectory_from_csv(str(request["setpoints"]))
-    name, parameters = request.get("trajectory"), request.get("parameters", {})
-    if not isinstance(name, str):
-        raise InputError(f"'trajectory' must be one of {', '.join(KINDS)}")
-    if not isinstance(parameters, dict):
-        raise InputError("'parameters' must be an object of names and values")
-    return trajectory(name, **parameters)

@@ -313,7 +313,14 @@ def _model(settings: Settings, root: Path) -> Iterator[Finding]:
     if path is None:
         yield Finding("model", "none deployed", "", "flights are lqr until the ground deploys one", NOTE)
         return
-    (finding,) = inspect([path], vehicle, settings.guard.deadline)
+    try:
+        (finding,) = inspect([path.read_bytes()], vehicle, settings.guard.deadline)
+    except OSError as error:
+        yield Finding("model", f"{path.name}: cannot be read ({error.strerror})", "", "deploy it again", FAIL)
+        return
+    if finding.open:
+        advice = "a newer kernel with Landlock and seccomp keeps the check of models from files and network"
+        yield Finding("check of models", "; ".join(finding.open), "", advice, NOTE)
     if finding.accepted and finding.info is not None:
         told = f"{finding.info.name} {finding.info.version}, {1e6 * finding.median:.0f} us an inference"
         yield Finding("model", told, "", "", OK)

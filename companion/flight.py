@@ -28,13 +28,16 @@ from companion.watch import Watch
 from models.contract import CONTROLLERS, CORRECTED
 from models.errors import InputError
 from models.reference import Trajectory, transfer
-from models.trajectory import ReferenceSample, Waypoint
+from models.trajectory import ReferenceSample, Waypoint, path
 
 Vector = tuple[float, float, float]
 
 IDLE, TAKEOFF, MISSION, LANDING, SILENT = "idle", "takeoff", "mission", "landing", "silent"
 _SETTLED_DISTANCE, _SETTLED_SPEED = 0.15, 0.25
 _LAND_FROM = 0.4  # m above ground at which the autopilot's own Land mode takes the last bit
+_PROVING_MOVE = 0.6
+"""m, aside and (half of it) up, of the moves before a mission by which a model from the ground is judged."""
+_PROVING_LAPS = 3
 _TUMBLED = 1.4
 """rad of tilt, twice what the cascade may ask for: a vehicle there for longer than `_TUMBLING` s has crashed, or
 nothing that a linear design sends can bring it back."""
@@ -95,7 +98,8 @@ class Safety:
 class Mission:
     """What to fly: a trajectory (home frame), how often, with which controller, guarded by what.
 
-    `guard` holds the models that correct; none for a controller without correction.
+    `guard` holds the models that correct; none for a controller without correction. `proving` s are flown before the
+    mission for a model that was deployed on the ground and has not proved itself yet.
     """
 
     identity: str
@@ -103,6 +107,7 @@ class Mission:
     controller: str = "lqr"
     repeat: int = 1
     guard: Guard | None = None
+    proving: float = 0.0
 
     def __post_init__(self) -> None:
         if self.controller not in CONTROLLERS:
@@ -118,7 +123,7 @@ class Leg:
     """A stretch of a flight: fly `trajectory`, then wait up to `settle` s until the vehicle is there.
 
     `corrects` where the correction acts: from the way to the start on, so that it has faded in when the mission
-    begins, and not while landing.
+    begins, and not while landing. `proves` where a model in the shadow is judged though no mission is flown yet.
     """
 
     phase: str
@@ -126,6 +131,7 @@ class Leg:
     settle: float = 0.0
     name: str = ""
     corrects: bool = False
+    proves: bool = False
 
 
 @dataclass(frozen=True)
@@ -428,6 +434,7 @@ class Flight:
         above = (0.0, 0.0, max(start[2], 0.6), self._yaw)
         legs = [
             Leg(TAKEOFF, transfer(self._here, above, safety.climb_speed, 1.5), name="climb"),
+            *self._proving(above, mission.proving),
             Leg(TAKEOFF, transfer(above, start, safety.transfer_speed, 2.0), 4.0, "to the start", True),
         ]
         for i in range(mission.repeat):
@@ -437,6 +444,24 @@ class Flight:
                 )
             legs.append(Leg(MISSION, trajectory, name=trajectory.name, corrects=True))
         return legs + self._way_home(end)
+
+    def _proving(self, above: Waypoint, seconds: float) -> list[Leg]:
+        """Moves along every axis above home, for `seconds` s: what a model has to show before it may act."""
+        if seconds <= 0.0:
+            return []
+        x, y, z, yaw = above
+        aside = min(_PROVING_MOVE, 0.4 * self.safety.fence_radius)
+        up = max(0.0, min(0.5 * _PROVING_MOVE, self.safety.fence_height - z - 0.5))
+        corners = [
+            above,
+            (x + aside, y, z, yaw),
+            (x + aside, y + aside, z + up, yaw),
+            (x, y + aside, z, yaw),
+            above,
+        ]
+        lap = Trajectory("proving", tuple(path(corners, 1.0, 3.0)))
+        laps = min(_PROVING_LAPS, math.ceil((seconds + 0.5) / lap.duration))
+        return [Leg(TAKEOFF, lap, 0.0, "proving", corrects=True, proves=True)] * laps
 
     def _way_home(self, begin: Waypoint) -> list[Leg]:
         above = (0.0, 0.0, max(begin[2], 0.6), begin[3])
@@ -456,7 +481,8 @@ class Flight:
             there = math.dist(position, end[:3]) < _SETTLED_DISTANCE
             still = math.hypot(*odometry.velocity) < _SETTLED_SPEED
             guard = self.mission.guard if self.mission is not None else None
-            fading = leg.corrects and guard is not None and not guard.tripped and guard.engaged < 1.0
+            acts = leg.corrects and guard is not None and guard.live != "" and not guard.tripped
+            fading = acts and guard is not None and guard.engaged < 1.0
             if late >= leg.settle or (there and still and not fading):
                 self._next_leg()
                 assert self._leg is not None
@@ -615,7 +641,7 @@ class Flight:
         if force is not None:
             measured = error_acceleration(odometry.quaternion, force, thrust, vehicle.mass)
         values = features(state, yaw, Attitude(roll, pitch, thrust), voltage, shadow.watch.wants_yaw)
-        flying = out.phase == MISSION  # only there would it act
+        flying = out.phase == MISSION or (self._leg is not None and self._leg.proves)
         out.shadow, out.guard = shadow.name, f"{out.guard}, shadow"
         out.shadow_raw = shadow.step(values, measured, out.interval if flying else 0.0)
         if shadow.refused:

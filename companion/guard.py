@@ -17,7 +17,7 @@ from dataclasses import astuple
 from typing import NamedTuple
 
 from companion.actuation import ACTS_AT_ONCE, Actuation
-from companion.watch import ZERO, Vector, Watch
+from companion.watch import ZERO, GuardLimits, Vector, Watch
 
 OFF, FADING_IN, ACTIVE, FADING_OVER, FADING_OUT, TRIPPED = (
     "off",
@@ -44,20 +44,26 @@ class Correction(NamedTuple):
 
 
 class Guard:
-    """Stands between models and command during one flight; begins with one model, live and not yet faded in.
+    """Stands between models and command during one flight; begins with one model, live and not yet faded in, or none.
 
-    `watch` is the first model's; its limits are the guard's. `on_trip` is told the name of a model and the reason
-    once, from the thread that calls `step`, and must not block. All methods belong to that thread.
+    `watch` is the first model's; its limits are the guard's, or `limits` where no model is live yet. `on_trip` is told
+    the name of a model and the reason once, from the thread that calls `step`, and must not block. All methods belong
+    to that thread.
     """
 
-    def __init__(self, watch: Watch, on_trip: Callable[[str, str], None] | None = None) -> None:
-        self.limits = watch.limits
-        self.wants_yaw = watch.wants_yaw
+    def __init__(
+        self,
+        watch: Watch | None,
+        on_trip: Callable[[str, str], None] | None = None,
+        limits: GuardLimits | None = None,
+    ) -> None:
+        self.limits = watch.limits if watch is not None else limits or GuardLimits()
+        self.wants_yaw = watch is not None and watch.wants_yaw
         self.inference_time = 0.0
         self._on_trip = on_trip
         self._live: Watch | None = watch
         self._last_good: Watch | None = None
-        self._weights: dict[Watch, float] = {watch: 0.0}
+        self._weights: dict[Watch, float] = {} if watch is None else {watch: 0.0}
         self._tripped: dict[str, Watch] = {}
         self._running = False
         self._applied = ZERO

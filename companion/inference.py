@@ -3,6 +3,7 @@ it."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
@@ -14,9 +15,10 @@ import numpy as np
 import onnxruntime
 
 from companion.actuation import ACTS_AT_ONCE, Actuation
+from companion.onnx_structure import why_not_self_contained
 from companion.watch import GuardLimits, Range, Watch
 from models import contract
-from models.errors import InputError
+from models.errors import InputError, shown
 from models.vehicle import Vehicle
 
 MAX_BYTES = 4 << 20
@@ -26,6 +28,7 @@ LOOK_ROWS = 3
 """Rows of features that a control tick asks for."""
 _TIMING_LIMIT = 0.5  # s; a model that is that slow needs no exact figure
 _RANGE_SAMPLES = 64
+_LONGEST_WORD = 200
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,19 @@ def check_model(onnx: bytes, vehicle: Vehicle, deadline: float = 0.002) -> Verdi
         return _check(onnx, vehicle, deadline)
     except _Refused as refusal:
         return Verdict(False, str(refusal))
+    except MemoryError:
+        return Verdict(False, "its check needs too much memory")
+    except Exception as error:  # noqa: BLE001 - what no check above foresaw is refused as well
+        return Verdict(False, f"its check failed ({type(error).__name__}): the file is hostile or damaged")
+
+
+def warm_up() -> None:
+    """Load what is loaded on first use, for a process that will soon be allowed to open no more files."""
+    np.random.default_rng(0).uniform(size=2)
+    np.median(np.ones(2))
+    json.loads("{}")
+    with contextlib.suppress(_Refused):
+        _open(b"")
 
 
 def open_model(onnx: bytes, info: ModelInfo) -> Model:
@@ -128,27 +144,32 @@ def open_model(onnx: bytes, info: ModelInfo) -> Model:
 def _check(onnx: bytes, vehicle: Vehicle, deadline: float) -> Verdict:
     if len(onnx) > MAX_BYTES:
         raise _Refused(f"the file has {len(onnx)} bytes; at most {MAX_BYTES} are accepted")
+    reason = why_not_self_contained(onnx)
+    if reason:
+        raise _Refused(reason)
     session = _open(onnx)
-    meta = dict(session.get_modelmeta().custom_metadata_map)
+    try:
+        meta = dict(session.get_modelmeta().custom_metadata_map)
+    except UnicodeDecodeError:
+        raise _Refused("its metadata are no text (UTF-8); export it again") from None
     for key in contract.REQUIRED_KEYS:
         if key not in meta:
             raise _Refused(f"its metadata lack '{key}'; export it with `groundstation deploy`")
     if meta[contract.KEY_CONTRACT] != contract.CONTRACT_VERSION:
         raise _Refused(
-            f"it follows contract {meta[contract.KEY_CONTRACT]!r}; this companion knows "
+            f"it follows contract {shown(meta[contract.KEY_CONTRACT])}; this companion knows "
             f"{contract.CONTRACT_VERSION!r}"
         )
     _check_vehicle(_json(meta, contract.KEY_VEHICLE, dict), vehicle)
     ranges = _ranges(_json(meta, contract.KEY_FEATURES, list))
     _check_ports(session, len(ranges))
-    chain = _json(meta, contract.KEY_CHAIN, list)
     info = ModelInfo(
         contract.model_hash(onnx),
-        meta[contract.KEY_NAME],
-        meta[contract.KEY_VERSION],
+        _word(meta, contract.KEY_NAME),
+        _word(meta, contract.KEY_VERSION),
         ranges,
-        tuple(chain),
-        meta[contract.KEY_DATA_HASH],
+        _chain(meta),
+        _word(meta, contract.KEY_DATA_HASH),
         _actuation(meta),
     )
     model = Model(session, info)
@@ -180,11 +201,34 @@ def _open(onnx: bytes) -> onnxruntime.InferenceSession:
 def _json(meta: dict[str, str], key: str, kind: type) -> Any:
     try:
         value = json.loads(meta[key])
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         value = None
     if not isinstance(value, kind):
         raise _Refused(f"its metadata '{key}' is not a JSON {'object' if kind is dict else 'list'}")
     return value
+
+
+def _word(meta: dict[str, str], key: str) -> str:
+    """A metadata text that people are shown: short, and one line."""
+    if len(meta[key]) > _LONGEST_WORD or not meta[key].isprintable():
+        raise _Refused(f"its metadata '{key}' is not one line of at most {_LONGEST_WORD} characters")
+    return meta[key]
+
+
+def _chain(meta: dict[str, str]) -> tuple[dict[str, Any], ...]:
+    """The effects that a model says it is made of: objects with a name and named numbers (or lists of them)."""
+    chain = _json(meta, contract.KEY_CHAIN, list)
+    for entry in chain:
+        if not isinstance(entry, dict) or not isinstance(entry.get("effect"), str):
+            raise _Refused(
+                f"its metadata '{contract.KEY_CHAIN}' must hold objects with 'effect' and 'parameters', not "
+                f"{shown(entry)}"
+            )
+        if not isinstance(entry.get("parameters", {}), dict):
+            raise _Refused(
+                f"its metadata '{contract.KEY_CHAIN}': the parameters of {shown(entry['effect'])} are no object"
+            )
+    return tuple(chain)
 
 
 def _actuation(meta: dict[str, str]) -> Actuation:
@@ -192,36 +236,47 @@ def _actuation(meta: dict[str, str]) -> Actuation:
         return ACTS_AT_ONCE
     numbers = _json(meta, contract.KEY_ACTUATION, dict)
     try:
-        return Actuation(**{str(name): float(value) for name, value in numbers.items()})
-    except (TypeError, ValueError) as error:
-        raise _Refused(f"its metadata '{contract.KEY_ACTUATION}': {error}") from None
+        return Actuation(**{str(name): _real(value) for name, value in numbers.items()})
+    except (TypeError, ValueError, OverflowError) as error:
+        raise _Refused(f"its metadata '{contract.KEY_ACTUATION}': {str(error)[:160]}") from None
+
+
+def _real(value: object) -> float:
+    """A number of JSON as a float; raises `TypeError` for anything else, `OverflowError` for what is too large."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{shown(value)} is no number")
+    return float(value)
 
 
 def _check_vehicle(stated: dict[str, Any], vehicle: Vehicle) -> None:
     name = stated.get("name")
     if name != vehicle.name:
-        raise _Refused(f"made for vehicle '{name}', this one is '{vehicle.name}'")
+        raise _Refused(f"made for vehicle {shown(name)}, this one is '{vehicle.name}'")
     for key, ours in (("mass", vehicle.mass), ("hover_thrust", vehicle.hover_thrust)):
         value = stated.get(key)
-        if type(value) not in (int, float) or not abs(float(value) - ours) <= 0.01 * ours:  # type: ignore[arg-type]
-            raise _Refused(f"made for {key} {value}, this vehicle has {ours:g}; refit it")
+        try:
+            fits = abs(_real(value) - ours) <= 0.01 * ours
+        except (TypeError, OverflowError):
+            fits = False
+        if not fits:
+            raise _Refused(f"made for {key} {shown(value)}, this vehicle has {ours:g}; refit it")
 
 
 def _ranges(entries: list[Any]) -> tuple[Range, ...]:
     ranges = []
     for entry in entries:
         try:
-            one = Range(str(entry["name"]), str(entry["unit"]), float(entry["low"]), float(entry["high"]))
-        except (KeyError, TypeError, ValueError):
+            one = Range(str(entry["name"]), str(entry["unit"]), _real(entry["low"]), _real(entry["high"]))
+        except (KeyError, TypeError, ValueError, OverflowError):
             raise _Refused("its metadata 'features' need name, unit, low and high in each entry") from None
         if not (math.isfinite(one.low) and math.isfinite(one.high) and one.low <= one.high):
-            raise _Refused(f"the training range of feature '{one.name}' is {one.low} to {one.high}")
+            raise _Refused(f"the training range of feature {shown(one.name)} is {one.low} to {one.high}")
         ranges.append(one)
     given = {one.name: one.unit for one in ranges}
     base = list(contract.FEATURES.items())
     if list(given.items()) not in (base, base + list(contract.YAW_FEATURES.items())):
         raise _Refused(
-            f"its features are {', '.join(given) or 'none'}; expected {', '.join(contract.FEATURES)} "
+            f"its features are {shown(', '.join(given)) if given else 'none'}; expected {', '.join(contract.FEATURES)} "
             f"with their units, and optionally {', '.join(contract.YAW_FEATURES)}"
         )
     return tuple(ranges)
@@ -231,7 +286,9 @@ def _check_ports(session: onnxruntime.InferenceSession, features: int) -> None:
     inputs, outputs = session.get_inputs(), session.get_outputs()
     for ports, name, width in ((inputs, contract.INPUT_NAME, features), (outputs, contract.OUTPUT_NAME, 3)):
         if [port.name for port in ports] != [name]:
-            raise _Refused(f"its ports are {[port.name for port in ports]}; expected one called '{name}'")
+            raise _Refused(
+                f"its ports are {shown([port.name for port in ports])}; expected one called '{name}'"
+            )
         shape = ports[0].shape
         free = len(shape) == 2 and (shape[0] is None or isinstance(shape[0], str) or shape[0] == 1)
         if ports[0].type != "tensor(float)" or not free or shape[1] not in (width, None):
@@ -252,7 +309,7 @@ def _check_golden(model: Model, meta: dict[str, str]) -> None:
     for key, columns in ((contract.KEY_GOLDEN_FEATURES, width), (contract.KEY_GOLDEN_DELTA, 3)):
         try:
             values = np.array(_json(meta, key, list), dtype=float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             values = np.empty(0)
         if (
             values.ndim != 2

@@ -2,27 +2,26 @@
 
 ONNX Runtime is a large program that reads what the ground sent: a hostile or damaged file may crash it, keep
 it busy for ever or make it eat the memory. So the contract and the golden vectors are checked in a child that
-runs when nothing else wants the processor, may use little memory and time, and answers with JSON. The
-companion opens a model only after its child accepted it. In flight and on the ground the way is the same.
+runs when nothing else wants the processor, may use little memory and time, reaches neither files nor network,
+and answers with JSON. It gets the file's bytes through a pipe. The companion opens a model only after its child
+accepted it. In flight and on the ground the way is the same.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import resource
-import signal
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from companion.child import ask_child, begin_child
+from companion.confined import confine, leave_network
 from models.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from companion.inference import ModelInfo
+    from companion.inference import ModelInfo, Verdict
 
 CHILD = (sys.executable, "-m", "companion.inspection")
 PATIENCE = 30.0
@@ -36,23 +35,27 @@ _ANSWER_LIMIT = 1 << 20
 
 @dataclass(frozen=True)
 class Finding:
-    """What the check of one file found; `info` only where it was accepted, `median` and `worst` s an inference."""
+    """What the check of one file found; `info` only where it was accepted, `median` and `worst` s an inference.
+
+    `open` tells which of the fences around the check this machine's kernel does not offer.
+    """
 
     accepted: bool
     reason: str
     info: ModelInfo | None = None
     median: float = 0.0
     worst: float = 0.0
+    open: tuple[str, ...] = ()
 
 
-def inspect(paths: Sequence[Path], vehicle: Vehicle, deadline: float) -> list[Finding]:
+def inspect(files: Sequence[bytes], vehicle: Vehicle, deadline: float) -> list[Finding]:
     """Check files as `companion.inference.check_model` does, in a child; never raises, whatever they hold.
 
     Blocks while the child runs. A file that takes the child down with it is refused; the others get another.
     """
     findings: list[Finding] = []
-    while len(findings) < len(paths):
-        rest = [str(path) for path in paths[len(findings) :]]
+    while len(findings) < len(files):
+        rest = files[len(findings) :]
         answers, end = _ask_child(rest, vehicle, deadline)
         findings += answers[: len(rest)]
         if len(answers) < len(rest):
@@ -60,36 +63,22 @@ def inspect(paths: Sequence[Path], vehicle: Vehicle, deadline: float) -> list[Fi
     return findings
 
 
-def _ask_child(paths: list[str], vehicle: Vehicle, deadline: float) -> tuple[list[Finding], str]:
+def _ask_child(files: Sequence[bytes], vehicle: Vehicle, deadline: float) -> tuple[list[Finding], str]:
     """Findings of one child, in order as far as it came, and how it ended."""
     request = {
-        "files": paths,
+        "sizes": [len(file) for file in files],
         "vehicle": {key: getattr(vehicle, key) for key in ("name", "mass", "hover_thrust")},
         "deadline": deadline,
         "processor_time": PROCESSOR_TIME,
         "memory": MEMORY,
     }
-    # One thread for the linear algebra: every other would ask for memory of its own.
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    child = subprocess.Popen(
-        CHILD,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=environment,
-    )
-    try:
-        out, _ = child.communicate(json.dumps(request).encode(), PATIENCE * len(paths))
-        end = _how_it_ended(child.returncode)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        out, _ = child.communicate()
-        end = f"its check did not end within {PATIENCE:g} s"
+    whole = json.dumps(request).encode() + b"\n" + b"".join(files)
+    out, end = ask_child(CHILD, whole, PATIENCE * len(files), PROCESSOR_TIME)
     findings = []
     for line in out.splitlines():
         try:
             findings.append(_finding(json.loads(line)))
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, RecursionError):
             break
     return findings, end
 
@@ -115,71 +104,64 @@ def _finding(answer: dict[str, Any]) -> Finding:
         info,
         float(answer["median"]),
         float(answer["worst"]),
+        tuple(str(one) for one in answer["open"]),
     )
-
-
-def _how_it_ended(code: int) -> str:
-    if code == -signal.SIGXCPU or code == -signal.SIGKILL:
-        return f"its check took more than {PROCESSOR_TIME} s of the processor, or was killed"
-    if code < 0:
-        return f"its check crashed ({signal.Signals(-code).name}): the file is hostile or damaged"
-    return f"its check ended with code {code}: the file is hostile or damaged"
 
 
 def _main() -> None:
     """The child: a request on standard input, one line of JSON a file on standard output."""
-    os.nice(19)
-    if hasattr(os, "SCHED_IDLE"):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    answers = os.fdopen(os.dup(1), "w")
-    nothing = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, 1)  # what ONNX Runtime prints is no answer
-    request = json.loads(sys.stdin.read())
-    from companion.inference import check_model
+    network = leave_network()
+    descriptor, whole = begin_child()
+    answers = os.fdopen(descriptor, "w")
+    from companion.inference import check_model, warm_up
 
-    _limit(request["memory"], request["processor_time"] * len(request["files"]))
+    warm_up()
+    line, _, rest = whole.partition(b"\n")
+    request = json.loads(line)
     vehicle = Vehicle(**request["vehicle"])
-    for path in request["files"]:
+    missing = confine(request["memory"] + len(whole), request["processor_time"] * len(request["sizes"]))
+    if network:
+        missing.append(network)
+    begin = 0
+    for size in request["sizes"]:
+        onnx, begin = rest[begin : begin + size], begin + size
         try:
-            verdict = check_model(Path(path).read_bytes(), vehicle, request["deadline"])
-            info = verdict.model.info if verdict.model is not None else None
-            answer: dict[str, Any] = {
-                "accepted": verdict.accepted,
-                "reason": verdict.reason,
-                "median": verdict.median if verdict.accepted else 0.0,
-                "worst": verdict.worst if verdict.accepted else 0.0,
-                "info": None,
-            }
-            if info is not None:
-                answer["info"] = {
-                    "hash": info.hash,
-                    "name": info.name,
-                    "version": info.version,
-                    "features": [(one.name, one.unit, one.low, one.high) for one in info.features],
-                    "chain": info.chain,
-                    "data_hash": info.data_hash,
-                    "actuation": astuple(info.actuation),
-                }
-        except (OSError, MemoryError) as error:
-            answer = {"accepted": False, "reason": str(error) or "its check needs too much memory"}
-            answer |= {"median": 0.0, "worst": 0.0, "info": None}
-        text = json.dumps(answer)
+            verdict = check_model(onnx, vehicle, request["deadline"])
+            answer = _answer(verdict)
+        except MemoryError:
+            answer = _refusal("its check needs too much memory")
+        text = json.dumps({**answer, "open": missing})
         if len(text) > _ANSWER_LIMIT:
             reason = f"its metadata have {len(text)} characters; at most {_ANSWER_LIMIT} are accepted"
-            text = json.dumps({"accepted": False, "reason": reason, "median": 0, "worst": 0, "info": None})
+            text = json.dumps({**_refusal(reason), "open": missing})
         answers.write(text + "\n")
         answers.flush()
 
 
-def _limit(memory: int, seconds: int) -> None:
-    """From here on `memory` more bytes and `seconds` of the processor at most, no files and no core dump."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0]) if sys.platform == "linux" else 0
-    if pages:
-        memory += pages * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+def _refusal(reason: str) -> dict[str, Any]:
+    return {"accepted": False, "reason": reason, "median": 0.0, "worst": 0.0, "info": None}
+
+
+def _answer(verdict: Verdict) -> dict[str, Any]:
+    """A verdict as JSON can carry it."""
+    if verdict.model is None:
+        return _refusal(verdict.reason)
+    info = verdict.model.info
+    return {
+        "accepted": verdict.accepted,
+        "reason": verdict.reason,
+        "median": verdict.median,
+        "worst": verdict.worst,
+        "info": {
+            "hash": info.hash,
+            "name": info.name,
+            "version": info.version,
+            "features": [(one.name, one.unit, one.low, one.high) for one in info.features],
+            "chain": info.chain,
+            "data_hash": info.data_hash,
+            "actuation": astuple(info.actuation),
+        },
+    }
 
 
 if __name__ == "__main__":

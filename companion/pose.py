@@ -158,6 +158,10 @@ class PoseFeed:
         self._thread = threading.Thread(target=self._run, name="pose", daemon=True)
         self._thread.start()
 
+    def refuse_size(self, reason: str) -> None:
+        """A message was too large to be looked at; only counts and tells."""
+        self._refuse("too large", reason)
+
     def take(self, payload: bytes) -> None:
         """A payload has arrived; only enqueues."""
         self._waiting.append((time.time_ns(), time.monotonic_ns(), payload))
@@ -205,9 +209,14 @@ class PoseFeed:
         while not self._closing:
             self._wake.wait(0.1)
             self._wake.clear()
-            while self._waiting and not self._closing:
-                self._handle(*self._waiting.popleft())
-            self._watch()
+            try:
+                while self._waiting and not self._closing:
+                    self._handle(*self._waiting.popleft())
+                self._watch()
+            except Exception as error:  # noqa: BLE001 - no packet, whatever it is, may end this thread
+                self._refuse(
+                    "failed", f"it could not be handled ({type(error).__name__}: {str(error)[:100]})"
+                )
 
     def _handle(self, arrived_ns: int, arrived_mono_ns: int, payload: bytes) -> None:
         settings = self.settings

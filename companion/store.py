@@ -4,8 +4,10 @@ and one may be staged: accepted by its check, but not live before it has proved 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +23,7 @@ from models.vehicle import Vehicle
 KEPT = 8
 """Models of the past that stay on board; each is checked again when the companion starts."""
 _HISTORY = "history.json"
+_HASH = re.compile("[0-9a-f]{12}")
 
 
 @dataclass
@@ -40,18 +43,21 @@ def live_file(folder: Path) -> Path | None:
 
 def _names_of(folder: Path) -> list[str]:
     try:
-        return [str(name) for name in json.loads((folder / _HISTORY).read_text(encoding="utf-8"))]
-    except (OSError, ValueError, TypeError, RecursionError):
+        names = json.loads((folder / _HISTORY).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
         return []
+    known = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    return [name for name in known if _HASH.fullmatch(name)]
 
 
 class ModelStore:
     """Accepted models in a folder; safe to use from several threads.
 
-    A model becomes live only after `companion.inspection` accepted it, and every one is checked again when the
-    companion starts: the runtime or the vehicle file may have changed in between. What is live is on the disk
-    before it is told, so that a power cut leaves either the one before or this one. `unsigned` says of a file why it
-    must not be opened ('' where it may): asked before anything reads it as a model.
+    A model is staged after `companion.inspection` accepted it, and becomes live once it has proved itself in flight;
+    so the history holds those that have. Every one is checked again when the companion starts: the runtime or the
+    vehicle file may have changed in between. What is live or staged is on the disk before it is told, so that a power
+    cut leaves either the one before or this one. `unsigned` says of a file why it must not be opened ('' where it may):
+    asked before anything reads it as a model. Raises `InputError` where the folder cannot be used.
     """
 
     def __init__(
@@ -68,10 +74,16 @@ class ModelStore:
         self._models: dict[str, Stored] = {}
         self._staged = ""
         self.refused_at_start: list[str] = []
-        folder.mkdir(parents=True, exist_ok=True)
-        for left in folder.glob("*.staged"):
-            left.unlink()
-        self._restore(_names_of(folder)[-KEPT:])
+        self.unfenced: tuple[str, ...] = ()
+        """Fences around the check of models that this machine's kernel does not offer, as seen by the last check."""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            staged = self._left_staged()
+        except OSError as error:
+            raise InputError(
+                f"{folder}: cannot keep models there ({error.strerror}); pass --models"
+            ) from None
+        self._restore(_names_of(folder)[-KEPT:], staged)
 
     @property
     def live(self) -> Model | None:
@@ -118,24 +130,31 @@ class ModelStore:
                     raise InputError(f"model {name}: cannot read it ({error.strerror})") from None
             return stored.model
 
+    def proved(self, name: str) -> bool:
+        """Whether a model has proved itself in flight, and was neither withdrawn nor forgotten since."""
+        with self._lock:
+            return name in self._history
+
     def stage(self, onnx: bytes) -> Finding:
         """Check a model, in a process of its own, and keep it beside the live one where it is accepted."""
         if len(onnx) > MAX_BYTES:
             return Finding(False, f"the file has {len(onnx)} bytes; at most {MAX_BYTES} are accepted")
         name = model_hash(onnx)
+        (finding,) = inspect([onnx], self._vehicle, self._deadline)
+        self.unfenced = finding.open
+        if finding.info is None or finding.info.hash != name:
+            return Finding(False, finding.reason)
         path = self._path(name, staged=True)
+        part = path.with_suffix(".part")
         try:
-            with path.open("wb") as file:
+            with part.open("wb") as file:
                 file.write(onnx)
                 file.flush()
                 os.fsync(file.fileno())
+            part.replace(path)
         except OSError as error:
-            path.unlink(missing_ok=True)
+            _remove(part)
             return Finding(False, f"cannot keep it on board ({error.strerror})")
-        (finding,) = inspect([path], self._vehicle, self._deadline)
-        if finding.info is None or finding.info.hash != name:
-            path.unlink(missing_ok=True)
-            return Finding(False, finding.reason)
         with self._lock:
             if self._staged != name:
                 self._forget_staged()
@@ -149,10 +168,14 @@ class ModelStore:
             if name != self._staged:
                 return "" if name == self.live_name else f"{name} is not staged"
             history = [other for other in self._history if other != name] + [name]
+            known = name in self._history
             try:
                 self._path(name, staged=True).replace(self._path(name))
                 self._save(history[-KEPT:])
             except OSError as error:
+                if not known:  # as it was: staged, and not in the history
+                    with contextlib.suppress(OSError):
+                        self._path(name).replace(self._path(name, staged=True))
                 return f"cannot keep it on board ({error.strerror})"
             self._staged = ""
             for gone in set(self._models) - set(self._history):
@@ -166,7 +189,7 @@ class ModelStore:
                 self._forget_staged()
 
     def deploy(self, onnx: bytes) -> dict[str, Any]:
-        """Check a model and make it live where it is accepted; the answer for the ground."""
+        """Check a model and make it live at once, for whoever knows already that it is good; accepted, or why not."""
         finding = self.stage(onnx)
         if not finding.accepted:
             return {"accepted": False, "reason": finding.reason}
@@ -233,43 +256,74 @@ class ModelStore:
     def _forget_staged(self) -> None:
         name, self._staged = self._staged, ""
         if name:
-            self._path(name, staged=True).unlink(missing_ok=True)
+            _remove(self._path(name, staged=True))
             if name not in self._history:
                 self._models.pop(name, None)
 
     def _forget(self, name: str) -> None:
         self._models.pop(name, None)
-        self._path(name).unlink(missing_ok=True)
+        _remove(self._path(name))
 
-    def _restore(self, names: list[str]) -> None:
-        there = []
-        for name in names:
-            gone = "" if self._path(name).is_file() else "its file is gone"
-            reason = gone or self._unsigned(self._path(name))
-            if reason:
-                self.refused_at_start.append(f"{name}: {reason}")
-            else:
-                there.append(name)
-        findings = inspect([self._path(name) for name in there], self._vehicle, self._deadline)
-        for name, finding in zip(there, findings, strict=True):
+    def _left_staged(self) -> str:
+        """The model that waited for its flight when the companion ended; '' without one. What else was left goes."""
+        for left in self._folder.glob("*.part"):
+            _remove(left)
+        there = sorted(self._folder.glob("*.staged"), key=lambda path: path.stat().st_mtime)
+        named = [path for path in there if _HASH.fullmatch(path.stem)]
+        for left in set(there) - set(named[-1:]):
+            _remove(left)
+        return named[-1].stem if named else ""
+
+    def _restore(self, names: list[str], staged: str) -> None:
+        there: list[tuple[str, bool, bytes]] = []
+        for name, waits in [*((name, False) for name in names), *([(staged, True)] if staged else [])]:
+            try:
+                path = self._path(name, waits)
+                if path.stat().st_size > MAX_BYTES:
+                    self.refused_at_start.append(f"{name}: its file has more than {MAX_BYTES} bytes")
+                    continue
+                reason = self._unsigned(path)
+                if reason:
+                    self.refused_at_start.append(f"{name}: {reason}")
+                    continue
+                there.append((name, waits, path.read_bytes()))
+            except OSError as error:
+                gone = isinstance(error, FileNotFoundError)
+                self.refused_at_start.append(f"{name}: its file {'is gone' if gone else 'cannot be read'}")
+        findings = inspect([onnx for _, _, onnx in there], self._vehicle, self._deadline)
+        for (name, waits, _), finding in zip(there, findings, strict=True):
+            self.unfenced = finding.open
             if finding.info is None or finding.info.hash != name:
                 reason = finding.reason if finding.info is None else "its file is another one"
                 self.refused_at_start.append(f"{name}: {reason}")
                 continue
-            self._models[name] = Stored(finding, finding.info)
-            self._history.append(name)
+            self._models.setdefault(name, Stored(finding, finding.info))
+            if waits:
+                self._staged = name
+            elif name not in self._history:
+                self._history.append(name)
 
     def _save(self, history: list[str]) -> None:
         """Write the history, and take it over once it is on the disk."""
         part = self._folder / (_HISTORY + ".part")
-        with part.open("w", encoding="utf-8") as file:
-            json.dump(history, file)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(self._folder / _HISTORY)
+        try:
+            with part.open("w", encoding="utf-8") as file:
+                json.dump(history, file)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(self._folder / _HISTORY)
+        except OSError:
+            _remove(part)
+            raise
         folder = os.open(self._folder, os.O_RDONLY)
         try:
             os.fsync(folder)
         finally:
             os.close(folder)
         self._history = history
+
+
+def _remove(path: Path) -> None:
+    """Take a file away; a disk that does not let us is told where it matters, when something is to be kept."""
+    with contextlib.suppress(OSError):
+        path.unlink()

@@ -30,6 +30,9 @@ LOCAL, WITH_KEYS = "tcp/127.0.0.1:7447", "tls/0.0.0.0:7447"
 
 INSECURE = "insecure: anybody on the network can read, fly and deploy"
 
+MOST_BYTES = 8 << 20
+"""The longest message that Zenoh puts together for us; a longer one falls there, before it takes memory here."""
+
 
 @dataclass(frozen=True)
 class ZenohSettings:
@@ -89,6 +92,7 @@ def plan_session(settings: ZenohSettings, keys: Keys | None = None, vehicle: str
         claim("scouting/multicast/enabled", False, ""),
         # Cached ticks and events are asked for by age.
         claim("timestamping/enabled", True, ""),
+        claim("transport/link/rx/max_message_size", MOST_BYTES, ""),
     ]
     if keys is not None:
         given += _with_keys(settings, keys, vehicle)

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from models.contract import CONTROLLERS
+from models.contract import CONTROLLERS, too_large
 from models.errors import InputError
 
 if TYPE_CHECKING:
@@ -137,7 +137,10 @@ def fly_command(
         _list_trajectories(as_json)
         return
     check_controller(controller)
-    mission = {**_mission(trajectory, parameters or []), "controller": controller, "repeat": repeat}
+    mission = {**_mission(trajectory, parameters or [], repeat), "controller": controller, "repeat": repeat}
+    reason = too_large("mission", len(json.dumps(mission)))
+    if reason:
+        raise InputError(f"{trajectory}: {reason}; split the file")
     settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)
     from groundstation.link import Link
 
@@ -177,19 +180,23 @@ def fly_command(
         )
 
 
-def _mission(trajectory: str, parameters: list[str]) -> dict[str, Any]:
+def _mission(trajectory: str, parameters: list[str], repeat: int) -> dict[str, Any]:
     """The mission's trajectory, checked here so that a typing error needs no vehicle."""
+    from models.reference import check_duration, trajectory_from_csv
     from models.reference import trajectory as named
-    from models.reference import trajectory_from_csv
 
     if trajectory.lower().endswith(".csv"):
         try:
+            reason = too_large("mission", Path(trajectory).stat().st_size)
+            if reason:
+                raise InputError(f"{trajectory}: {reason}; split the file")
             text = Path(trajectory).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{trajectory}: cannot read the setpoints ({error}); check the path") from None
         if parameters:
             raise InputError(f"{trajectory}: a table of setpoints has no parameters; leave --set out")
-        trajectory_from_csv(text)
+        path = trajectory_from_csv(text, trajectory)
+        check_duration(path.duration * repeat, f"{trajectory}, {repeat} times,")
         return {"setpoints": text}
     values: dict[str, float | str] = {}
     for pair in parameters:
@@ -200,7 +207,8 @@ def _mission(trajectory: str, parameters: list[str]) -> dict[str, Any]:
             values[key.strip()] = float(value)
         except ValueError:
             values[key.strip()] = value.strip()
-    named(trajectory, **values)
+    path = named(trajectory, **values)
+    check_duration(path.duration * repeat, f"trajectory '{trajectory}', {repeat} times,")
     return {"trajectory": trajectory, "parameters": values}
 
 
@@ -292,7 +300,7 @@ def deploy_command(
     ] = None,
     shadow: Annotated[
         float | None,
-        typer.Option(help="In flight: seconds to evaluate it before it is applied.", min=0.5, max=600.0),
+        typer.Option(help="Seconds of flight to evaluate it before it is applied.", min=0.5, max=600.0),
     ] = None,
     wait: Annotated[
         bool, typer.Option("--wait", help="In flight: follow it until it is live or refused.")
@@ -311,11 +319,12 @@ def deploy_command(
     keys: KeysOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Send a model to the companion, which checks it and makes it live, or says why not.
+    """Send a model to the companion, which checks it and lets it prove itself, or says why not.
 
-    In flight it is evaluated beside the live one first, and takes over only where it predicts no worse than the
-    plain linear model. With --roll-back a model in the shadow is withdrawn; without one, the previous model
-    becomes live again.
+    It is evaluated beside the flight first, in the shadow, and takes over only where it predicts no worse than the
+    plain linear model: at once in flight; deployed on the ground, in the first seconds of the next corrected flight,
+    before the mission begins. A model that has proved itself before is live at once. With --roll-back a model in the
+    shadow, or one that waits for it, is withdrawn; without one, the previous model becomes live again.
     """
     from groundstation.link import Link
 
@@ -345,7 +354,7 @@ def deploy_command(
     states = {
         "live": "is live as",
         "shadow": "is in the shadow as",
-        "staged": "has not proved itself before landing, and waits for the next corrected flight, as",
+        "staged": "is staged, and flies its first seconds of the next corrected flight in the shadow, as",
     }
     what = states.get(str(result.get("state", "live")), "is there as")
     console.print(escape(f"accepted by '{vehicle}': {model.name} {what} {result['hash']}"), highlight=False)
@@ -363,6 +372,9 @@ def _read_onnx(model: Path | None) -> bytes:
     if model is None:
         raise InputError("which model? Pass the file that `groundstation model export` wrote, or --roll-back")
     try:
+        reason = too_large("model", model.stat().st_size)
+        if reason:
+            raise InputError(f"{model}: {reason}; pass the one that `groundstation model export` wrote")
         onnx = model.read_bytes()
     except OSError as error:
         raise InputError(
@@ -484,7 +496,7 @@ def status_command(
     if shadow:
         waiting = f"{shadow['title']}, {shadow['remaining']:.1f} s to go"
     elif staged:
-        waiting = f"{staged['hash']} ({staged['name']} {staged['version']}), not judged yet"
+        waiting = f"{staged['hash']} ({staged['name']} {staged['version']}), in the next corrected flight"
     for what, value in (
         ("vehicle", f"{escape(status['vehicle'])}: {ready}"),
         (

@@ -65,6 +65,26 @@ REQUIRED_KEYS = (
 GOLDEN_TOLERANCE = 1e-3  # m/s², absolute
 
 
+REQUEST_BYTES: dict[str, int] = {
+    "status": 1 << 10,
+    "mission": 1 << 20,
+    "model": 4 << 20,
+    "record": 4 << 10,
+    "pose": 4 << 10,
+}
+"""The most bytes that a message on each key may have; what is larger is refused before anybody looks at it."""
+ATTACHED_BYTES = 4 << 10
+"""The most bytes attached to a request: a signature has a few hundred."""
+SELECTOR_CHARACTERS = 256
+"""The most characters of a selector's parameters."""
+
+
+def too_large(leaf: str, size: int) -> str:
+    """'' where a message of `size` bytes may be sent on this key, otherwise the reason why it is refused."""
+    most = REQUEST_BYTES[leaf]
+    return "" if size <= most else f"the {leaf} message has {size} bytes; at most {most} are accepted"
+
+
 def model_hash(onnx: bytes) -> str:
     """Name of a model by its content: the first 12 hexadecimal digits of the file's SHA-256."""
     return hashlib.sha256(onnx).hexdigest()[:12]

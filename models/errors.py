@@ -20,6 +20,17 @@ class InputError(Exception):
     """
 
 
+def shown(value: object, most: int = 60) -> str:
+    """What somebody sent, as text for a message: never longer than `most`, never more than a line."""
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 10**18:
+        return "a whole number of more than 18 digits"
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        return f"a {type(value).__name__}"
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
 def run_command_line(app: Callable[[], object]) -> None:
     """Run a typer application; an `InputError` becomes one line on standard error and exit code 2.
 

@@ -18,6 +18,10 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from models.errors import shown
+
+_FARTHEST = 1e5
+"""m: farther than motion capture and vision see, and small enough for what the autopilot is sent."""
 _UNIT = 0.02
 """How far from one the quaternion's square may be: rounding, but not another convention."""
 
@@ -55,14 +59,14 @@ def pose_from_json(payload: bytes) -> Pose:
     try:
         table = json.loads(payload)
         position, quaternion = table["position"], table["quaternion"]
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, RecursionError):
         raise ValueError("it is no JSON object with 'position' and 'quaternion'") from None
     numbers = _numbers("position", position, 3) + _numbers("quaternion", quaternion, 4)
     size = sum(x * x for x in numbers[3:])
     if not abs(size - 1.0) < _UNIT:
         raise ValueError(f"its quaternion has length {math.sqrt(size):.3g}, not 1")
     time_ns = table.get("time_ns", 0)
-    if type(time_ns) is not int or time_ns < 0:
+    if type(time_ns) is not int or not 0 <= time_ns < 1 << 63:
         raise ValueError("its 'time_ns' is no whole number of nanoseconds since 1970")
     spread = [
         _numbers(name, [table.get(name, math.nan)], 1, True)[0] for name in ("position_std", "attitude_std")
@@ -75,9 +79,22 @@ def pose_from_json(payload: bytes) -> Pose:
 def _numbers(name: str, values: Any, count: int, may_be_unknown: bool = False) -> list[float]:
     if not isinstance(values, list) or len(values) != count:
         raise ValueError(f"its '{name}' is no list of {count} numbers")
+    numbers = []
     for value in values:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ValueError(f"its '{name}' holds {value!r}, which is no number")
-        if not math.isfinite(value) and not may_be_unknown:
-            raise ValueError(f"its '{name}' holds {value!r}, which is not finite")
-    return [float(value) for value in values]
+            raise ValueError(f"its '{name}' holds {shown(value)}, which is no number")
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if may_be_unknown and math.isnan(number):
+            numbers.append(number)
+        elif not abs(number) <= _FARTHEST:
+            raise ValueError(
+                f"its '{name}' holds {shown(value)}, which is not finite or beyond {_FARTHEST:g}"
+            )
+        elif may_be_unknown and number < 0.0:
+            raise ValueError(f"its '{name}' is {shown(value)}; a deviation is not negative")
+        else:
+            numbers.append(number)
+    return numbers

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.errors import InputError
+from models.contract import REQUEST_BYTES
+from models.errors import InputError, shown
 from models.trajectory import (
     Curve,
     ReferenceColumns,
@@ -41,6 +42,15 @@ __all__ = [
     "trajectory_from_csv",
     "transfer",
 ]
+
+LONGEST = 3600.0
+"""s, the longest trajectory; no quadrotor of this size flies longer on one battery."""
+CLOSEST = 0.001
+"""s, the least time between two setpoints of a table: the fastest control loop meant here ticks once in that."""
+MOST_ROWS = 20_000
+"""Setpoints of one table."""
+_FARTHEST = 1e6
+"""m, m/s, m/s²: no setpoint is beyond."""
 
 ACCELERATION = 4.0
 """Greatest reference acceleration of a transfer inside a trajectory unless it says otherwise, m/s²."""
@@ -82,25 +92,35 @@ def _kind(name: str, text: str, *parameters: Parameter) -> Callable[..., Callabl
     return register
 
 
-def trajectory(name: str, **parameters: float | str) -> Trajectory:
+def trajectory(name: str, /, **parameters: float | str) -> Trajectory:
     """The trajectory of this name.
 
     Raises `InputError` for an unknown name or parameter (with a suggestion) and for a value out of its range.
     """
     if name not in KINDS:
-        raise InputError(f"no trajectory '{name}'; {_suggest(name, list(KINDS))}")
+        raise InputError(f"no trajectory {shown(name)}; {_suggest(name, list(KINDS))}")
     kind = KINDS[name]
     known = {p.name: p for p in kind.parameters}
     values: dict[str, float | str] = {p.name: p.default for p in kind.parameters}
     for key, value in parameters.items():
         if key not in known:
-            raise InputError(f"trajectory '{name}' has no parameter '{key}'; {_suggest(key, list(known))}")
+            raise InputError(
+                f"trajectory '{name}' has no parameter {shown(key)}; {_suggest(key, list(known))}"
+            )
         values[key] = _checked(name, known[key], value)
-    return Trajectory(name, tuple(kind.build(**values)), values)
+    built = Trajectory(name, tuple(kind.build(**values)), values)
+    check_duration(built.duration, f"trajectory '{name}'")
+    return built
+
+
+def check_duration(seconds: float, where: str) -> None:
+    """Raise `InputError` for a flight that is too long; false for NaN as well."""
+    if not seconds <= LONGEST:
+        raise InputError(f"{where} takes {seconds:.4g} s; at most {LONGEST:g} s are flown at once")
 
 
 def _suggest(word: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(word, known, 1)
+    close = difflib.get_close_matches(word[:40], known, 1)
     return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
 
 
@@ -108,12 +128,12 @@ def _checked(name: str, parameter: Parameter, value: object) -> float | str:
     where = f"trajectory '{name}': {parameter.name}"
     if parameter.choices:
         if value not in parameter.choices:
-            raise InputError(f"{where} is {value!r}; it must be one of {', '.join(parameter.choices)}")
+            raise InputError(f"{where} is {shown(value)}; it must be one of {', '.join(parameter.choices)}")
         return str(value)
     try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise InputError(f"{where} must be a number, not {value!r}") from None
+        number = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{where} must be a number, not {shown(value)}") from None
     if not parameter.low <= number <= parameter.high:  # false for NaN as well
         raise InputError(
             f"{where} = {number:g} is outside {parameter.low:g} to {parameter.high:g} "
@@ -468,7 +488,13 @@ def trajectory_from_csv(text: str, where: str = "setpoints") -> Trajectory:
     differences of the rows, and zero at both ends. Raises `InputError` with line and column for what cannot
     be used.
     """
-    rows = list(csv.reader(io.StringIO(text.lstrip("\ufeff"))))
+    if len(text) > REQUEST_BYTES["mission"]:
+        most = REQUEST_BYTES["mission"]
+        raise InputError(f"{where}: {len(text)} characters; at most {most} are flown at once, split the file")
+    try:
+        rows = list(csv.reader(io.StringIO(text.lstrip("\ufeff"))))
+    except csv.Error as error:
+        raise InputError(f"{where}: not a table of comma-separated values ({error})") from None
     rows = [row for row in rows if row and not row[0].lstrip().startswith("#")]
     if not rows:
         raise InputError(
@@ -481,20 +507,28 @@ def trajectory_from_csv(text: str, where: str = "setpoints") -> Trajectory:
     for name in names:
         if name not in ("t", "x", "y", "z", *_OPTIONAL):
             raise InputError(
-                f"{where}: unknown column '{name}'; {_suggest(name, ['t', 'x', 'y', 'z', *_OPTIONAL])}"
+                f"{where}: unknown column {shown(name)}; {_suggest(name, ['t', 'x', 'y', 'z', *_OPTIONAL])}"
             )
     if len(set(names)) != len(names):
-        raise InputError(f"{where}: a column is named twice in {','.join(names)}; keep one")
+        raise InputError(f"{where}: a column is named twice in {shown(','.join(names))}; keep one")
     for trio in ("vx vy vz", "ax ay az"):
         given = [n for n in trio.split() if n in names]
         if given and len(given) != 3:
             raise InputError(f"{where}: only {', '.join(given)} of {trio}; give all three or none")
     values = _numbers(rows[1:], names, where)
     column = {name: values[:, i] for i, name in enumerate(names)}
-    t = column["t"] - column["t"][0]
+    with np.errstate(over="ignore"):
+        t = column["t"] - column["t"][0]
     if np.any(np.diff(t) <= 0):
         line = int(np.argmax(np.diff(t) <= 0)) + 3
         raise InputError(f"{where}: time does not increase at row {line}; sort the rows and drop duplicates")
+    if np.any(np.diff(t) < CLOSEST):
+        line = int(np.argmax(np.diff(t) < CLOSEST)) + 3
+        raise InputError(
+            f"{where}: row {line} comes {t[line - 2] - t[line - 3]:.3g} s after the one before; at least "
+            f"{CLOSEST:g} s must lie between two setpoints"
+        )
+    check_duration(float(t[-1]), where)
     position = np.stack(
         [column["x"], column["y"], column["z"], np.unwrap(column.get("yaw", np.zeros_like(t)))], -1
     )
@@ -512,8 +546,8 @@ def trajectory_from_csv(text: str, where: str = "setpoints") -> Trajectory:
 def _numbers(rows: list[list[str]], names: list[str], where: str) -> np.ndarray:
     if len(rows) < 2:
         raise InputError(f"{where}: {len(rows)} rows of numbers; at least 2 are needed")
-    if len(rows) > 200_000:
-        raise InputError(f"{where}: {len(rows)} rows; at most 200000 are flown at once, split the file")
+    if len(rows) > MOST_ROWS:
+        raise InputError(f"{where}: {len(rows)} rows; at most {MOST_ROWS} are flown at once, split the file")
     out = np.empty((len(rows), len(names)))
     for i, row in enumerate(rows):
         if len(row) != len(names):
@@ -523,10 +557,14 @@ def _numbers(rows: list[list[str]], names: list[str], where: str) -> np.ndarray:
                 out[i, j] = float(cell)
             except ValueError:
                 raise InputError(
-                    f"{where}: row {i + 2}, column '{names[j]}': '{cell}' is not a number"
+                    f"{where}: row {i + 2}, column '{names[j]}': {shown(cell)} is not a number"
                 ) from None
             if not math.isfinite(out[i, j]):
-                raise InputError(f"{where}: row {i + 2}, column '{names[j]}': '{cell}' is not finite")
+                raise InputError(f"{where}: row {i + 2}, column '{names[j]}': {shown(cell)} is not finite")
+            if names[j] != "t" and abs(out[i, j]) > _FARTHEST:
+                raise InputError(
+                    f"{where}: row {i + 2}, column '{names[j]}': {shown(cell)} is beyond {_FARTHEST:g}"
+                )
     return out
 
 

@@ -22,6 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+_BLOCK = 500
+
 Vector = tuple[float, float, float]
 Waypoint = tuple[float, float, float, float]
 """x, y, z in m and yaw in rad."""
@@ -137,6 +139,26 @@ class Curve:
 Segment = Polynomial | Curve
 
 
+class SetpointTable(Sequence[Segment]):
+    """Polynomials kept as arrays, for long tables: durations (N,) s, coefficients (N, 4, 6)."""
+
+    def __init__(self, durations: np.ndarray, coefficients: np.ndarray) -> None:
+        self.durations, self.coefficients = durations, coefficients
+        self._last: tuple[int, Polynomial] | None = None
+
+    def __len__(self) -> int:
+        return len(self.durations)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return tuple(self[i] for i in range(*index.indices(len(self))))
+        last = self._last
+        if last is None or last[0] != index:
+            rows = tuple(map(tuple, self.coefficients[index].tolist()))
+            last = self._last = (index, Polynomial(float(self.durations[index]), rows))
+        return last[1]
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """A named, finite reference in the home frame (ENU axes, z above ground).
@@ -145,11 +167,15 @@ class Trajectory:
     """
 
     name: str
-    segments: tuple[Segment, ...]
+    segments: Sequence[Segment]
     parameters: dict[str, float | str] = field(default_factory=dict)
+    known_extent: tuple[Vector, Vector, float, float] | None = None
+    """Bounds, greatest speed and acceleration, where somebody has worked them out already."""
 
     @cached_property
     def _ends(self) -> list[float]:
+        if isinstance(self.segments, SetpointTable):
+            return np.cumsum(self.segments.durations).tolist()
         return [float(x) for x in np.cumsum([s.duration for s in self.segments])]
 
     @cached_property
@@ -198,27 +224,40 @@ class Trajectory:
         return (*s.position, s.yaw)
 
     @cached_property
-    def _extent(self) -> tuple[Vector, Vector, float, float]:
-        columns = self.sample(np.append(np.arange(0.0, self.duration, 0.02), np.maximum(self._ends, 0.0)))
-        low, high = columns.position.min(axis=0), columns.position.max(axis=0)
-        speed = float(np.linalg.norm(columns.velocity, axis=1).max())
-        acceleration = float(np.linalg.norm(columns.acceleration, axis=1).max())
+    def extent(self) -> tuple[Vector, Vector, float, float]:
+        """Lowest and highest x, y, z, greatest speed and acceleration, sampled every 20 ms and in each segment."""
+        if self.known_extent is not None:
+            return self.known_extent
+        ends = np.array(self._ends)
+        times = np.unique(
+            np.concatenate(
+                [np.arange(0.0, self.duration, 0.02), ends, 0.5 * (ends + np.append(0.0, ends[:-1]))]
+            )
+        )
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        speed = acceleration = 0.0
+        for begin in range(0, len(times), _BLOCK):  # in pieces: neither memory nor the interpreter for long
+            columns = self.sample(times[begin : begin + _BLOCK])
+            low = np.minimum(low, columns.position.min(axis=0))
+            high = np.maximum(high, columns.position.max(axis=0))
+            speed = max(speed, float(np.linalg.norm(columns.velocity, axis=1).max()))
+            acceleration = max(acceleration, float(np.linalg.norm(columns.acceleration, axis=1).max()))
         return tuple(map(float, low)), tuple(map(float, high)), speed, acceleration  # type: ignore[return-value]
 
     @property
     def bounds(self) -> tuple[Vector, Vector]:
         """Lowest and highest x, y, z (m, home frame) of the reference, sampled every 20 ms."""
-        return self._extent[0], self._extent[1]
+        return self.extent[0], self.extent[1]
 
     @property
     def max_speed(self) -> float:
         """Greatest reference speed, m/s."""
-        return self._extent[2]
+        return self.extent[2]
 
     @property
     def max_acceleration(self) -> float:
         """Greatest reference acceleration, m/s²."""
-        return self._extent[3]
+        return self.extent[3]
 
 
 def hold(at: Waypoint, duration: float) -> Polynomial:

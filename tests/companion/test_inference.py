@@ -181,5 +181,5 @@ class TestStore:
         for path in tmp_path.glob("*.onnx"):
             path.write_bytes(path.read_bytes()[:-10])
         assert ModelStore(tmp_path, VEHICLE, 0.1).live is None
-        (tmp_path / "history.json").write_text(json.dumps(["absent"]))
-        assert "absent" in ModelStore(tmp_path, VEHICLE, 0.1).refused_at_start[0]
+        (tmp_path / "history.json").write_text(json.dumps(["../absent", 5, "0123456789ab"]))
+        assert "0123456789ab" in ModelStore(tmp_path, VEHICLE, 0.1).refused_at_start[0]
