@@ -96,6 +96,7 @@ class Companion:
             records,
             settings.rate,
             self.emit,
+            require_record=settings.require_record,
         )
         self._vehicle_time_us = 0
         self._errors_told = 0
@@ -160,9 +161,7 @@ class Companion:
         """Tell an event to the ground and to the record; any thread, never blocks."""
         event = make_event(level, kind, text, self._vehicle_time_us)
         self.telemetry.event(event)
-        recorder = self.director.recorder
-        if recorder is not None:
-            recorder.event(event)
+        self.director.records.event(event)
 
     def _control(self, odometry: Odometry) -> None:
         """The control loop: one odometry message in, at most one setpoint out, then the book-keeping."""
@@ -180,9 +179,7 @@ class Companion:
         self.flight.watch(latest)
         self._vehicle_time_us = odometry.vehicle_time_us
         data = make_tick(odometry, latest, outcome, latency).SerializeToString()
-        recorder = self.director.recorder
-        if recorder is not None:
-            recorder.tick(data, odometry.vehicle_time_us, odometry.host_time_ns)
+        self.director.records.tick(data, odometry.vehicle_time_us, odometry.host_time_ns)
         self.telemetry.tick(data)
         self.watchdog.tick()
 

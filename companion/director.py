@@ -13,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from companion.guard import Guard
 from companion.message_rates import link_too_slow, odometry_too_low
 from companion.mission_request import mission_request
 from companion.pose import PoseFeed
+from companion.records import Records
 from companion.shadow import Shadow, ShadowLimits
 from companion.store import ModelStore
 from companion.vehicle_link import Rates, VehicleLink
@@ -29,7 +29,6 @@ from companion.watch import GuardLimits
 from models.contract import CORRECTED
 from models.design import Design
 from models.errors import InputError, shown
-from models.record import FlightRecorder
 from models.reference import Trajectory
 from models.vehicle import Vehicle
 
@@ -73,10 +72,10 @@ class Director:
     safety: Safety
     guard_limits: GuardLimits
     shadow_limits: ShadowLimits
-    records: Path
+    folder: Path
     rate: float
     emit: Callable[[str, str, str], None]
-    recorder: FlightRecorder | None = None
+    require_record: bool = True
     rates: Rates | None = None
     pose: PoseFeed | None = None
     stopping: threading.Event = field(default_factory=threading.Event)
@@ -88,6 +87,9 @@ class Director:
     _number: int = 0
     _seconds: dict[str, float] = field(default_factory=dict)
     """How long the models from the ground are to be in the shadow."""
+
+    def __post_init__(self) -> None:
+        self.records = Records(self.folder, self.rate, self.require_record, self.emit)
 
     # Asked by the ground, on the service thread
 
@@ -212,7 +214,7 @@ class Director:
             if rates is None
             else {"odometry": round(rates.odometry, 1), "imu": round(rates.imu, 1)},
             "pose": {} if self.pose is None else self.pose.status(),
-            "recording": str(self.recorder.path) if self.recorder else "",
+            "recording": self.records.path,
             "malformed_messages": self.link.malformed,
             **self.store.describe(),
         }
@@ -229,6 +231,9 @@ class Director:
         low = self.safety.takeoff_voltage * self.vehicle.nominal_voltage
         if 0.0 < latest.battery_voltage < low:
             return f"the battery has {latest.battery_voltage:.1f} V, a flight needs {low:.1f} V"
+        no_record = self.records.why_not()
+        if no_record:
+            return no_record
         if self.pose is not None and self.pose.why_not:
             return self.pose.why_not
         if self.lost_position:
@@ -387,18 +392,18 @@ class Director:
     def _fly(self, progress: Progress) -> None:
         mission = progress.mission
         progress.state = "flying"
-        reason = self._check() or self._start(progress)
+        reason = self._check(mission) or self._start(progress)
         if reason:
             self.flight.cancel(reason)
             self.emit("error", "mission_failed", f"{mission.trajectory.name} not flown: {reason}")
-            self._stop_recording()
+            progress.record = self.records.end()
             progress.state, progress.reason = "failed", reason
             return
         self._accompany()
         self._settle()
         outcome = self.flight.outcome
         self.emit("info", "mission_ended", f"{mission.trajectory.name}: {outcome}")
-        self._stop_recording()
+        progress.record = self.records.end()
         # Told last: whoever hears that it is over may fetch the record, which must be whole by then.
         progress.reason = outcome
         progress.state = "finished" if outcome == "finished" else "aborted"
@@ -426,9 +431,9 @@ class Director:
         progress.mission = replace(progress.mission, guard=guard, proving=proving)
         return ""
 
-    def _check(self) -> str:
+    def _check(self, mission: Mission) -> str:
         self.rates = self.link.measure(0.5)
-        return self.not_ready()
+        return self.not_ready() or self.records.why_not(mission.trajectory.duration * mission.repeat)
 
     def _start(self, progress: Progress) -> str:
         """Stream, Offboard, arm, go; '' or the reason why not."""
@@ -448,7 +453,11 @@ class Director:
             return self._refused(f"the autopilot refused Offboard ({reason})")
         if not self._wait(lambda: latest.flight_mode == "OFFBOARD", _MODE_TIMEOUT):
             return f"the autopilot stayed in {latest.flight_mode}"
-        self._record(progress)
+        mission = progress.mission
+        model = (mission.guard.live or self.store.staged_name) if mission.guard is not None else ""
+        progress.record, reason = self.records.begin(mission, model, self.vehicle, self.design)
+        if reason:
+            return reason
         reason = self.link.arm()
         if reason:
             return self._refused(f"the autopilot refused to arm ({reason})")
@@ -478,6 +487,7 @@ class Director:
         while flight.phase != IDLE:
             time.sleep(0.02)
             self._settle()
+            self.records.look()
             now = time.monotonic()
             if self.stopping.is_set() and flight.phase not in (LANDING, SILENT):
                 flight.land("the companion is shutting down", return_home=False)
@@ -521,30 +531,3 @@ class Director:
                 return False
             time.sleep(0.01)
         return True
-
-    def _record(self, progress: Progress) -> None:
-        mission = progress.mission
-        stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
-        name = f"{stamp}-{mission.identity}-{mission.trajectory.name}-{mission.controller}.mcap"
-        metadata = {
-            "mission": mission.identity,
-            "trajectory": mission.trajectory.name,
-            "controller": mission.controller,
-            "model": (mission.guard.live or self.store.staged_name) if mission.guard is not None else "",
-            "repeat": str(mission.repeat),
-            **{f"parameter.{key}": str(value) for key, value in mission.trajectory.parameters.items()},
-        }
-        try:
-            self.recorder = FlightRecorder(self.records / name, self.vehicle, self.design, metadata)
-            progress.record = name
-        except InputError as error:
-            self.emit("error", "record_failed", str(error))
-
-    def _stop_recording(self) -> None:
-        recorder, self.recorder = self.recorder, None
-        if recorder is None:
-            return
-        recorder.close()
-        if recorder.dropped or recorder.error:
-            text = recorder.error or f"{recorder.dropped} messages missing in {recorder.path.name}"
-            self.emit("warning", "record_incomplete", text)

@@ -31,7 +31,8 @@ class Settings:
     `design` empty means `design.json` beside the vehicle file. `rate` in Hz, `timeout` in s to wait for an
     autopilot, `system` its MAVLink system id, 0 for the first that is heard. `realtime` is the priority (SCHED_FIFO)
     that the control thread asks for, 0 for none. `keys` is the vehicle's folder of `groundstation keys`;
-    `unsigned_models` one of `companion.signature.UNSIGNED`.
+    `unsigned_models` one of `companion.signature.UNSIGNED`. `require_record`: no flight begins whose record cannot be
+    written.
     """
 
     vehicle: str = ""
@@ -53,6 +54,7 @@ class Settings:
     realtime: int = field(default=0, metadata={"zero": True})
     keys: str = ""
     unsigned_models: str = LOCAL
+    require_record: bool = True
 
     def checked(self) -> Settings:
         """The same, or `InputError` for a value without sense."""

@@ -7,6 +7,7 @@ specification, https://mcap.dev/spec.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import queue
 import struct
@@ -62,16 +63,33 @@ class FlightRecorder:
         self.path = Path(path)
         self.dropped = 0
         self.error = ""
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("xb")
-        except OSError as error:
-            raise InputError(f"{path}: cannot write the flight record ({error.strerror})") from None
+        """Why nothing more is written, empty while all is well; whoever flies tells it at once."""
+        self.rescued = False
+        """Whether the file was taken away in flight and has been written anew."""
         self._queue: queue.Queue[tuple[int, int, int, bytes] | None] = queue.Queue(queue_limit)
         now = 0 if simulated else time.time_ns()
         self._epoch = 0 if simulated else now - time.monotonic_ns()
         self._sequence = [0, 0]
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._disk = _Disk(self.path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot write the flight record ({error.strerror})") from None
+        try:
+            self._begin(vehicle, design, metadata or {}, now, simulated)
+        except OSError as error:
+            self._disk.give_up()
+            with contextlib.suppress(OSError):
+                self.path.unlink()  # a beginning without a flight is of no use to anybody
+            raise InputError(f"{path}: cannot write the flight record ({error.strerror})") from None
+        self._thread = threading.Thread(target=self._write, name="flight-recorder", daemon=True)
+        self._thread.start()
+
+    def _begin(
+        self, vehicle: Vehicle, design: Design | None, metadata: dict[str, str], now: int, simulated: bool
+    ) -> None:
+        """What stands before the first tick; forced to the disk, so that a full one is seen before the flight."""
+        self._writer = Writer(self._disk, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="trueflight", library="trueflight")
         schemas = FileDescriptorSet()
         DESCRIPTOR.CopyToProto(schemas.file.add())
@@ -81,7 +99,7 @@ class FlightRecorder:
             schema = self._writer.register_schema(name, "protobuf", schemas.SerializeToString())
             self._channels.append(self._writer.register_channel(topic, "protobuf", schema))
         created = {} if simulated else {"created_ns": str(now)}
-        self._writer.add_metadata("flight", {"vehicle": vehicle.name, **created, **(metadata or {})})
+        self._writer.add_metadata("flight", {"vehicle": vehicle.name, **created, **metadata})
         self._writer.add_attachment(
             now, now, "vehicle.toml", "application/toml", vehicle_to_toml(vehicle).encode()
         )
@@ -89,9 +107,7 @@ class FlightRecorder:
             self._writer.add_attachment(
                 now, now, "design.json", "application/json", design_to_json(design).encode()
             )
-        self._file.flush()
-        self._thread = threading.Thread(target=self._write, name="flight-recorder", daemon=True)
-        self._thread.start()
+        self._disk.sync()
 
     def tick(self, tick: Tick | bytes, vehicle_time_us: int, host_time_ns: int) -> None:
         """Enqueue a tick (message, or its serialised bytes where the caller has them already)."""
@@ -106,7 +122,8 @@ class FlightRecorder:
     def close(self, timeout: float = 10.0) -> None:
         """Write what is queued and the index, and close the file. Idempotent."""
         if self._thread.is_alive():
-            self._queue.put(None, timeout=timeout)
+            with contextlib.suppress(queue.Full):  # its thread gave up in this moment
+                self._queue.put(None, timeout=timeout)
             self._thread.join(timeout)
 
     def __enter__(self) -> FlightRecorder:
@@ -137,14 +154,21 @@ class FlightRecorder:
                 if item:
                     self._append(*item)
                     unsynced = True
-                if unsynced and time.monotonic() - synced >= SYNC_PERIOD:
-                    self._file.flush()
-                    os.fdatasync(self._file.fileno())
+                if time.monotonic() - synced >= SYNC_PERIOD:
+                    self.rescued = self._disk.still_there() or self.rescued
+                    if unsynced:
+                        self._disk.sync()
                     synced, unsynced = time.monotonic(), False
             except OSError as error:  # a full disk must not stop a flight; it is told instead
-                self.error = f"{self.path}: {error.strerror}"
-                self._file.close()
+                self._stop(error.strerror or str(error))
                 return
+            except Exception as error:  # noqa: BLE001 - nor may anything else end the record without a word
+                self._stop(f"{type(error).__name__}: {error}")
+                return
+
+    def _stop(self, why: str) -> None:
+        self.error = f"{self.path}: {why}"
+        self._disk.give_up()
 
     def _append(self, channel: int, log_time: int, host_time: int, data: bytes) -> None:
         self._sequence[channel] += 1
@@ -157,9 +181,70 @@ class FlightRecorder:
         counts = {"dropped": self.dropped, "ticks": self._sequence[0], "events": self._sequence[1]}
         self._writer.add_metadata("end", {key: str(value) for key, value in counts.items()})
         self._writer.finish()
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
+        self._disk.still_there()
+        self._disk.sync()
+        self._disk.give_up()
+
+
+class _Disk:
+    """The record's file: what is written is whole or not there, and comes back where somebody takes the file away.
+
+    Raises `OSError` as the system does.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._size = 0
+
+    def write(self, data: bytes) -> int:
+        """All of `data`, or what was there before and an error: a reader finds no torn record."""
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._descriptor, self._size)
+            raise
+        self._size += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Bytes written."""
+        return self._size
+
+    def flush(self) -> None:
+        """Nothing is held back here."""
+
+    def sync(self) -> None:
+        """Force what was written to the disk."""
+        os.fdatasync(self._descriptor)
+
+    def still_there(self) -> bool:
+        """Look whether the name still leads to this file; where not, write all of it anew. Whether that was so."""
+        here = os.fstat(self._descriptor)
+        try:
+            there = os.stat(self._path)
+            if (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino):
+                return False
+        except OSError:
+            pass
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        anew = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        old, self._descriptor = self._descriptor, anew
+        size, self._size = self._size, 0
+        try:
+            while self._size < size:
+                self.write(os.pread(old, min(1 << 20, size - self._size), self._size))
+        finally:
+            os.close(old)
+        return True
+
+    def give_up(self) -> None:
+        """Close the file as it is."""
+        with contextlib.suppress(OSError):
+            os.close(self._descriptor)
 
 
 def vehicle_to_toml(vehicle: Vehicle) -> str:

@@ -117,7 +117,7 @@ def test_a_deployed_model_flies_as_correction(companion: Companion) -> None:
     onnx = drag_model(0.1)
     answer = companion.ask("model", onnx)
     assert answer["accepted"], answer
-    assert answer["live"] == contract.model_hash(onnx)
+    assert (answer["state"], answer["staged"]["hash"]) == ("staged", contract.model_hash(onnx))
     status = companion.done(
         companion.fly(trajectory="lemniscate", parameters={"laps": 1.0, "speed": 2.0}, controller="corrected")
     )
@@ -147,21 +147,23 @@ def test_a_correction_outside_its_training_trips_and_the_flight_goes_on(companio
             "name": name,
             "unit": unit,
             "low": 0.0 if name == "z" else -100.0,
-            "high": 0.3 if name == "z" else 100.0,
+            "high": 2.0 if name == "z" else 100.0,
         }
         for name, unit in contract.FEATURES.items()
     ]
-    weights = np.zeros((10, 3))
-    onnx = linear_model(weights, (0.3, 0.0, 0.0), metadata={contract.KEY_FEATURES: narrow})
+    onnx = linear_model(np.zeros((10, 3)), (0.1, 0.0, 0.0), metadata={contract.KEY_FEATURES: narrow})
     assert companion.ask("model", onnx)["accepted"]
     status = companion.done(
-        companion.fly(trajectory="hover", parameters={"duration": 3.0}, controller="corrected")
+        companion.fly(
+            setpoints=rows(*[(0.0, 0.0, 1.0, 0.0)] * 2, *[(0.0, 0.0, 3.0, 0.0)] * 6), controller="corrected"
+        )
     )
     assert status["state"] == "finished", status
     ticks = record_of(companion, status).ticks
     flown = ticks["phase"] == "mission"
+    assert ticks["guard"][flown][0] == "active", "it proved itself on the way to the mission"
     assert ticks["guard"][flown][-1].startswith("tripped: z outside its training range")
-    np.testing.assert_allclose(ticks["correction"][flown], ticks["trim"][flown], atol=1e-12)
+    np.testing.assert_allclose(ticks["correction"][flown][-1], ticks["trim"][flown][-1], atol=1e-12)
     assert np.abs(ticks["trim"][flown][-1]).max() == 0.0, "the trim goes with the model"
     assert contract.model_hash(onnx) in wait_for(lambda: companion.told("guard_trip"), "the event")[-1]
     assert companion.ask("model", {"command": "rollback"})["accepted"]
