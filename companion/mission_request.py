@@ -40,7 +40,7 @@ class MissionRequest:
 def read_json(payload: bytes) -> dict[str, Any]:
     """The JSON object of a request; `{}` for none. Raises `InputError` for anything else."""
     try:
-        value = json.loads(payload) if payload else {}
+        value = json.loads(payload.decode()) if payload else {}
     except RecursionError:
         raise InputError("the request is nested too deeply") from None
     except ValueError as error:
@@ -150,6 +150,8 @@ def _main() -> None:
         answer = {"reason": str(error)[:1000]}
     except MemoryError:
         answer = {"reason": "it needs too much memory"}
+    except Exception as error:  # noqa: BLE001 - what no check foresaw is refused as well
+        answer = {"reason": f"the mission could not be read ({type(error).__name__})"}
     if "reason" in answer:
         numbers = b""
     with os.fdopen(descriptor, "wb") as out:

@@ -48,7 +48,7 @@ def full_after(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
     monkeypatch.setattr(record.os, "write", limited)
 
 
-@pytest.mark.parametrize("room", [0, 1, 200, 900])
+@pytest.mark.parametrize("room", [0, 1, 200, 500])
 def test_on_a_full_disk_no_record_begins_and_none_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
