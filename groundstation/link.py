@@ -174,7 +174,7 @@ class Link:
             time.sleep(POLL)
 
     def deploy(self, onnx: bytes, shadow: float | None = None) -> dict[str, Any]:
-        """Send a model, signed with an engineer's keys; the answer's `state` is `shadow` in flight, there for `shadow` s,
+        """Send a model, signed with an engineer's keys; the answer's `state` is `shadow` in flight, for `shadow` s,
         `staged` on the ground, or `live` where it has proved itself in an earlier flight.
 
         Raises `InputError` where the companion refuses it.
