@@ -68,16 +68,23 @@ def confine(memory: int, seconds: int) -> list[str]:
     missing = _no_files_and_sockets()
     if pages:
         memory += pages * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        _at_most(resource.RLIMIT_AS, memory)
+    _at_most(resource.RLIMIT_CPU, seconds)
+    _at_most(resource.RLIMIT_FSIZE, 1 << 20)
+    _at_most(resource.RLIMIT_CORE, 0)
     # What is open stays open; nothing else can be opened, whatever it is.
-    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_NPROC, (0, 0))
+    _at_most(resource.RLIMIT_NOFILE, 0)
+    _at_most(resource.RLIMIT_NPROC, 0)
     if sys.platform == "linux":
         missing += _filter_calls()
     return missing
+
+
+def _at_most(kind: int, limit: int) -> None:
+    """Lower a limit; one that is lower already stays, for nobody may raise it again."""
+    _, hard = resource.getrlimit(kind)
+    limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+    resource.setrlimit(kind, (limit, limit))
 
 
 def _no_files_and_sockets() -> list[str]:
