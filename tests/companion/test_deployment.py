@@ -219,7 +219,7 @@ def test_a_model_that_turns_bad_after_it_took_over_gives_way_to_the_last_good_on
 
 
 def test_rolled_back_by_command_in_flight_it_fades_to_the_previous_model(companion: Companion) -> None:
-    first, second = drag_model(0.05), drag_model(0.3)
+    first, second = drag_model(0.05), drag_model(0.08)
     for onnx in (first, second):
         deploy(companion, onnx)
         mission = companion.fly(
