@@ -208,7 +208,8 @@ class Companion:
     def _status(self) -> dict[str, Any]:
         """What the companion does, and who may make it do something else."""
         status = self.director.status()
-        signers = {entry["hash"]: self._signatures.signer(entry["hash"]) for entry in status["models"]}
+        known = [*status["models"], *([status["staged"]] if status["staged"] else [])]
+        signers = {entry["hash"]: self._signatures.signer(entry["hash"]) for entry in known}
         return {
             **status,
             "access": {**self.access, "signers": signers},

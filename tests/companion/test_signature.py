@@ -142,12 +142,12 @@ def test_a_companion_with_keys_is_read_flown_and_given_models_by_role(root: Path
                         anna.deploy(onnx)
                 with link("bob") as bob:
                     if start:
-                        assert bob.status()["live"] == model_hash(onnx), "checked again and live"
+                        assert bob.status()["staged"]["hash"] == model_hash(onnx), "checked again, and waits"
                         assert bob.status()["access"]["signers"] == {model_hash(onnx): "bob"}
                     else:
                         with pytest.raises(InputError, match="it is not signed"):
                             bob.request("model", onnx, 60.0)
-                        assert bob.deploy(onnx)["live"] == model_hash(onnx)
+                        assert bob.deploy(onnx)["state"] == "staged"
                     if start:
                         assert bob.roll_back()["accepted"]
             finally:
