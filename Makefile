@@ -6,7 +6,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 SEED ?= 7
 
-.PHONY: setup demo test lint bench clean
+.PHONY: setup demo test lint bench faults clean
 
 setup: $(VENV)/.installed
 
@@ -33,6 +33,12 @@ lint: setup
 
 bench: setup
 	for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
+
+# make faults QUICK=1 is a tenth of it; SCALE=0.3 and FAULTS="--only silences,kills" choose more finely.
+SCALE ?= $(if $(QUICK),0.1,1)
+
+faults: setup
+	$(BIN)/python tests/faults/campaign.py --scale $(SCALE) $(FAULTS)
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

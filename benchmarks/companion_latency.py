@@ -8,7 +8,8 @@ documentation shows them (`plugins`), `mavlink_direct` in both directions with a
 (`direct`), and `companion run` in flight, with its record and one listener on Zenoh. All three ask for
 the same messages at the same rates, so that the link and the autopilot have the same to do. They take
 turns, `--rounds` times, because other programs on the machine disturb them; latencies of all rounds are
-pooled. A setpoint counts as lost when none came within 50 ms.
+pooled. A setpoint counts as lost when none came within 50 ms, or when a later odometry message was answered first: the
+companion's setpoints tell by their time which one they answer, those of the bare programs are taken in their order.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def autopilot(mavlink: int, port: int, flying: bool, seconds: float) -> None:
     vehicle = load_vehicle(VEHICLE)
     pilot = Autopilot(Simulator(vehicle, choose(["none"], vehicle, 0), 0), Parameters(vehicle))
     server = Server(pilot, Link(("127.0.0.1", port), ("127.0.0.1", mavlink), 0))
-    pending: deque[float] = deque()
+    pending: deque[tuple[float, int]] = deque()
     latencies: list[float] = []
     sent = 0
     begin = [0.0]
@@ -69,17 +70,20 @@ def autopilot(mavlink: int, port: int, flying: bool, seconds: float) -> None:
         if message.get_msgId() == mav.MAVLINK_MSG_ID_ODOMETRY and peer.permanent:
             now = time.perf_counter()
             if measuring(now):
-                pending.append(now)
+                pending.append((now, message.time_usec // 1000 & 0xFFFFFFFF))
                 sent += 1
         send(peer, message)
 
     def timed_handle(message: Any, peer: Any) -> Any:
         now = time.perf_counter()
         answered.append(now)
-        while pending and now - pending[0] > LOST_AFTER:
+        while pending and now - pending[0][0] > LOST_AFTER:
             pending.popleft()
-        if pending:
-            latencies.append(now - pending.popleft())
+        answers = message.time_boot_ms
+        while answers and pending and pending[0][1] < answers:
+            pending.popleft()
+        if pending and answers in (0, pending[0][1]):
+            latencies.append(now - pending.popleft()[0])
         return handle(message, peer)
 
     server._send = timed_send  # type: ignore[method-assign]
