@@ -4,22 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from floods import floods, starved
 from promise import Row
 from rig import PATIENT
 from silences import kills
-
-from models import contract
 
 
 def broken(rows: list[Row]) -> list[Row]:
     return [row for row in rows if not row.kept]
 
 
-@pytest.mark.skipif(
-    not hasattr(contract, "REQUEST_BYTES"), reason="requests are not bounded yet: they take GBs"
-)
 def test_a_flight_goes_on_in_floods_and_obeys_none_of_them(tmp_path: Path) -> None:
     rows = list(floods(tmp_path, 100, 1, gap=10.0, settings=PATIENT))  # a busy machine makes gaps of its own
     assert len(rows) == 10
