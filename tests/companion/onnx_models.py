@@ -154,6 +154,20 @@ def nan_model(drag: float, limit: float) -> bytes:
     return packed(nodes, constants, lambda features: features @ weights, metadata=metadata)
 
 
+def bang_bang_model(size: float) -> bytes:
+    """A damper that knows two answers: `size` m/s² against the direction of flight, however slow it is."""
+    names = list(contract.FEATURES)
+    weights = np.zeros((len(names), 3), dtype=np.float32)
+    weights[names.index("vx"), 0] = weights[names.index("vy"), 1] = 20.0
+    nodes = [
+        helper.make_node("MatMul", [contract.INPUT_NAME, "w"], ["h"]),
+        helper.make_node("Tanh", ["h"], ["side"]),
+        helper.make_node("Mul", ["side", "size"], [contract.OUTPUT_NAME]),
+    ]
+    constants = {"w": weights, "size": np.array([-size], dtype=np.float32)}
+    return packed(nodes, constants, lambda features: -size * np.tanh(features @ weights))
+
+
 def deep_model(width: int = 800, depth: int = 40) -> bytes:
     """A network of `depth` equal layers: it keeps to the contract, and takes milliseconds."""
     rng = np.random.default_rng(5)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from onnx_models import (
+    bang_bang_model,
     constant_model,
     deep_model,
     drag_model,
@@ -118,6 +119,22 @@ def test_a_good_model_is_shadowed_takes_over_without_a_step_and_is_live_after_la
     assert jumps(record_of(companion, status)).max() <= 1.0
     assert companion.ask("status")["live"] == b
     assert companion.ask("status")["last_good"] == a
+
+
+def test_a_bad_model_deployed_on_the_ground_never_acts(companion: Companion) -> None:
+    """It knows its golden vectors and stays within its authority: nothing but the flight shows what it is."""
+    onnx = bang_bang_model(2.9)
+    assert deploy(companion, onnx)["state"] == "staged"
+    mission = companion.fly(trajectory="hover", parameters={"duration": 3.0}, controller="corrected")
+    assert "worse than none" in told_of(companion, "model_refused", onnx)
+    status = companion.done(mission)
+    assert status["state"] == "finished", status
+    ticks = record_of(companion, status).ticks
+    assert contract.model_hash(onnx) in ticks["shadow"]
+    assert contract.model_hash(onnx) not in ticks["model"]
+    assert "mission" not in ticks["phase"][ticks["shadow"] == contract.model_hash(onnx)]
+    assert np.nanmax(np.linalg.norm(ticks["position"] - ticks["position_reference"], axis=1)) < 0.5
+    assert not companion.ask("status")["staged"]
 
 
 BAD: dict[str, tuple[bytes, str]] = {
