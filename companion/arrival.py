@@ -96,6 +96,7 @@ class Arrivals:
         self.clock, self.echo = VehicleClock(), VehicleClock()
         self.overtaken = 0
         self.repeated = 0
+        self.age = math.inf
         self.last_us = -1
         """The newest stamp, by the vehicle's clock; -1 before the first."""
         self._done_ns = 0
@@ -106,7 +107,7 @@ class Arrivals:
     def judge(self, vehicle_us: int, host_ns: int) -> Arrival:
         """The arrival at `host_ns` (monotonic, now) of the sample that is of `vehicle_us` by the vehicle's clock."""
         previous, stamp = self.last_us, 1000 * vehicle_us
-        age = self._age(stamp, host_ns)
+        age = self.age = self._age(stamp, host_ns)
         period = 1e-6 * (vehicle_us - previous)
         if -_RESTART < period <= 0.0:
             self.repeated += 1
@@ -124,6 +125,11 @@ class Arrivals:
         """The answer to the PING that left at `asked_ns` has been read, after the last sample."""
         if self.last_us >= 0:
             self.echo.answered(asked_ns, 1000 * self.last_us)
+
+    def status(self) -> dict[str, float | int | None]:
+        """For JSON: age of the last sample in ms, None before the first; how many were overtaken, and repeated."""
+        age = round(1e3 * self.age, 1) if math.isfinite(self.age) else None
+        return {"age_ms": age, "overtaken": self.overtaken, "repeated": self.repeated}
 
     def done(self, host_ns: int) -> None:
         """The control law has answered to the last sample."""

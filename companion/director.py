@@ -172,7 +172,7 @@ class Director:
     def status(self) -> dict[str, Any]:
         """What the companion is doing, for JSON."""
         latest, flight = self.link.latest, self.flight
-        candidate = flight.candidate
+        candidate, not_ready = flight.candidate, self.not_ready()
         with self._lock:
             missions = [
                 {
@@ -197,8 +197,8 @@ class Director:
             "landed": latest.landed,
             "battery_voltage": round(latest.battery_voltage, 3),
             "position": {} if latest.estimator is None else latest.estimator.describe(),
-            "ready": not self.not_ready(),
-            "not_ready": self.not_ready(),
+            "ready": not not_ready,
+            "not_ready": not_ready,
             "mission": mission.identity if mission else "",
             "guard": mission.guard.status if mission and mission.guard else "off",
             "shadow": {}
@@ -213,6 +213,7 @@ class Director:
             "rates": {}
             if rates is None
             else {"odometry": round(rates.odometry, 1), "imu": round(rates.imu, 1)},
+            "odometry": self.link.arrivals.status(),
             "pose": {} if self.pose is None else self.pose.status(),
             "recording": self.records.path,
             "malformed_messages": self.link.malformed,
@@ -282,8 +283,9 @@ class Director:
             raise InputError(f"trajectory '{path.name}': {reason}")
         if self.stopping.is_set():
             raise InputError("the companion is shutting down")
-        if self.flight.phase == IDLE and self.not_ready():
-            raise InputError(self.not_ready())
+        not_ready = self.not_ready() if self.flight.phase == IDLE else ""
+        if not_ready:
+            raise InputError(not_ready)
         with self._lock:
             if len(self._queue) >= QUEUE_LIMIT:
                 raise InputError(f"{QUEUE_LIMIT} missions are waiting already")

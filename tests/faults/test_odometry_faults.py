@@ -163,4 +163,5 @@ def test_age_stands_in_the_record(link: Link) -> None:
     status = link.companion.done(identity)
     assert status["state"] == "finished", status
     age = read_record(link.companion.records / status["record"]).ticks["age"]
+    assert link.companion.ask("status")["odometry"]["age_ms"] < 50.0
     assert -0.005 < sorted(age)[len(age) // 2] < 0.05
