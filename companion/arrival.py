@@ -7,9 +7,9 @@ left, so that each answer bounds the vehicle's present from above, however late 
 bound of the last few is taken; what it is off by is what the fastest question needed to get there.
 
 PX4 1.14 to 1.17 seldom tell it through MAVSDK: they address their answers to whoever stands in memory that they did not
-fill, and MAVSDK drops what is not for us. Every PX4 answers to PING instead, without its time; but the answer stands in the
-same queue as the odometry, so that the odometry read just before it tells the time of the answer to within a period.
-What delays the odometry alone is not seen in that way, and what delays all of it is.
+fill, and MAVSDK drops what is not for us. Every PX4 answers to PING instead, without its time; but the answer stands in
+the same queue as the odometry, so that the odometry read just before it tells the time of the answer to a period. What
+delays the odometry alone is not seen in that way, and what delays all of it is.
 """
 
 from __future__ import annotations
