@@ -272,7 +272,7 @@ def blueprint() -> rrb.Blueprint:
                 curves("rates", "body rates sent (deg/s): roll red, pitch green, yaw blue"),
                 curves("correction", "correction (m/s²): x red, y green, z blue; thin: in the shadow"),
                 rrb.Horizontal(
-                    curves("latency", "latency (ms), age of the odometry grey, model orange"),
+                    curves("latency", "latency (ms): age grey, model orange"),
                     curves("battery", "battery (V)"),
                 ),
             ),
