@@ -61,7 +61,7 @@ class Stage:
             for pattern in ("trueflight/*/*", "trueflight/quad5/tick/@adv/**")
         ]
         self.telemetry = vehicle(session, "quad5", self.asked, folder / "records", self.signatures)
-        self.telemetry.subscribe("pose", lambda payload: None)
+        self.telemetry.subscribe("pose", lambda payload: None, lambda reason: None)
 
     def __enter__(self) -> Stage:
         return self
