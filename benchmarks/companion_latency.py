@@ -79,10 +79,9 @@ def autopilot(mavlink: int, port: int, flying: bool, seconds: float) -> None:
         answered.append(now)
         while pending and now - pending[0][0] > LOST_AFTER:
             pending.popleft()
-        answers = message.time_boot_ms
-        while answers and pending and pending[0][1] < answers:
+        while flying and pending and pending[0][1] < message.time_boot_ms:
             pending.popleft()
-        if pending and answers in (0, pending[0][1]):
+        if pending and (not flying or pending[0][1] == message.time_boot_ms):
             latencies.append(now - pending.popleft()[0])
         return handle(message, peer)
 
