@@ -15,7 +15,7 @@ from models.session import (
     LISTEN,
     Claim,
     claim,
-    claims_of,
+    claims_of_settings,
     configuration,
     controlled,
     endpoints,
@@ -76,17 +76,9 @@ def plan_session(settings: ZenohSettings, keys: Keys | None = None, vehicle: str
     Raises `InputError` where settings contradict each other or the keys, and where another machine could get in
     without keys and `insecure` is not set.
     """
-    told = "the setting [zenoh]"
-    given = [
-        claim(path, value, f"{flag} or {told} {name} = {value}")
-        for path, value, flag, name in (
-            ("mode", settings.mode, "-m", "mode"),
-            (CONNECT, list(settings.connect), "-e", "connect"),
-            (LISTEN, list(settings.listen), "-l", "listen"),
-        )
-        if value
-    ]
-    given += claims_of(settings.cfg)
+    given = claims_of_settings(
+        "the setting [zenoh]", settings.mode, settings.connect, settings.listen, settings.cfg
+    )
     otherwise = [
         claim(LISTEN, [WITH_KEYS if keys else LOCAL], ""),
         claim("scouting/multicast/enabled", False, ""),

@@ -30,7 +30,7 @@ from models.session import (
     ENCRYPTED,
     LISTEN,
     claim,
-    claims_of,
+    claims_of_settings,
     configuration,
     endpoints,
     exposed,
@@ -401,17 +401,7 @@ def _several(session: zenoh.Session, vehicle: str, there: Sequence[Answer]) -> s
 
 def _open(settings: Settings, keys: Keys | None) -> tuple[zenoh.Session, str, list[str]]:
     """The session, the endpoints it is for, and how others could reach it without keys."""
-    told = "the setting"
-    given = [
-        claim(path, value, f"{flag} or {told} {name} = {value}")
-        for path, value, flag, name in (
-            ("mode", settings.mode, "-m", "mode"),
-            (CONNECT, list(settings.connect), "-e", "connect"),
-            (LISTEN, list(settings.listen), "-l", "listen"),
-        )
-        if value
-    ]
-    given += claims_of(settings.cfg)
+    given = claims_of_settings("the setting", settings.mode, settings.connect, settings.listen, settings.cfg)
     if keys is not None:
         if keys.role == VEHICLE:
             raise InputError(f"{keys.folder}: keys of the vehicle '{keys.name}'; pass a person's folder")

@@ -43,6 +43,22 @@ def claims_of(pairs: Iterable[str]) -> list[Claim]:
     return claims
 
 
+def claims_of_settings(
+    told: str, mode: str, connect: Iterable[str], listen: Iterable[str], cfg: Iterable[str]
+) -> list[Claim]:
+    """What the flags `-m`, `-e`, `-l`, `--cfg`, or the settings of the same meaning, say; `told` names the latter."""
+    given = [
+        claim(path, value, f"{flag} or {told} {name} = {value}")
+        for path, value, flag, name in (
+            ("mode", mode, "-m", "mode"),
+            (CONNECT, list(connect), "-e", "connect"),
+            (LISTEN, list(listen), "-l", "listen"),
+        )
+        if value
+    ]
+    return given + claims_of(cfg)
+
+
 def claim(path: str, value: Any, who: str) -> Claim:
     """A claim of a plain value."""
     return Claim(path, json.dumps(value), who)
