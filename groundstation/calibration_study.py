@@ -395,13 +395,10 @@ def _each(study: Study, wanted: Sequence[Sortie], jobs: int) -> Iterator[Case]:
     # each worker uses one core; the variables are read when the workers' numpy is loaded
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    pool = worker_pool(jobs)
-    try:
+    with worker_pool(jobs) as pool:
         with interrupts_held():
             begun = [pool.submit(_work, study, s) for s in wanted]
         yield from (one.result() for one in as_completed(begun))
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def forget_diagnoses(study: Study) -> None:

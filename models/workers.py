@@ -11,26 +11,47 @@ from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 
 
-def worker_pool(jobs: int) -> ProcessPoolExecutor:
+@contextmanager
+def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of `jobs` processes, each a fresh interpreter: forking a process that has threads (a progress bar's) may
-    hang. Hand out the work inside `interrupts_held`, or a worker that still starts may be interrupted."""
-    return ProcessPoolExecutor(jobs, get_context("spawn"), _serve_parent)
+    hang. At the end of the block work under way is finished and the rest is dropped. A request to end (SIGTERM) is a
+    KeyboardInterrupt inside the block, so that it takes the same orderly way. Hand out the work inside
+    `interrupts_held`, or a worker that still starts may be interrupted."""
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _serve_parent)
+    with _ended_as_interrupted():
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """An interrupt (Ctrl-C goes to every process of a terminal) waits until the end of the block; processes that are
-    started in it never see one."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """Interrupts (Ctrl-C goes to every process of a terminal) and requests to end wait until the end of the block;
+    processes that are started in it do not see them before they serve."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@contextmanager
+def _ended_as_interrupted() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # only there may a handler be set
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def _serve_parent() -> None:
     """In the worker: end when the parent does; what was half-written is removed by the next run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     parent = parent_process()
     assert parent is not None
 

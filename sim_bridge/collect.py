@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,20 +72,20 @@ def collect(
     missing = [flight for flight in wanted if flight.name not in collection.flown]
     if not missing:
         return
-    pool = worker_pool(max(1, min(jobs, len(missing))))
-    with interrupts_held():
-        under_way = {pool.submit(_fly, flight, collection.folder): flight for flight in missing}
+    under_way: dict[Future[Flown], Flight] = {}
     try:
-        for done in as_completed(list(under_way)):
-            flight = under_way.pop(done)
-            yield flight, _kept(collection, flight, done.result())
+        with worker_pool(max(1, min(jobs, len(missing)))) as pool:
+            with interrupts_held():
+                under_way.update({pool.submit(_fly, flight, collection.folder): flight for flight in missing})
+            for done in as_completed(list(under_way)):
+                flight = under_way.pop(done)
+                yield flight, _kept(collection, flight, done.result())
     except BrokenProcessPool:
         raise InputError(
             f"{collection.folder}: a process was ended from outside (out of memory?); the same command continues, with "
             "fewer --jobs if need be"
         ) from None
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
         for late, flight in under_way.items():
             if late.done() and not late.cancelled() and late.exception() is None:
                 _kept(collection, flight, late.result())

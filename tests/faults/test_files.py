@@ -151,7 +151,8 @@ def test_a_collection_leaves_no_workers_behind_and_goes_on(how: signal.Signals, 
     workers = _workers(child.pid)
     child.send_signal(how)
     _, told = child.communicate(timeout=60)
-    assert b"Traceback" not in told
+    if how != signal.SIGKILL:  # nothing of it is left then that could end a worker which still starts
+        assert b"Traceback" not in told and b"leaked" not in told
     end = time.monotonic() + 20
     while any(_alive(pid) for pid in workers) and time.monotonic() < end:
         time.sleep(0.05)
