@@ -32,9 +32,9 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from groundstation.diagnosis import diagnose
-from groundstation.fitting import BLOCK, Problem
-from groundstation.measurement import measure
+from groundstation.identify.fitting import BLOCK, Problem
+from groundstation.identify.translation import diagnose
+from groundstation.measured.measurement import measure
 from groundstation.reading import read_flight
 from models.design import load_design
 from models.effect import Effect, Stage

@@ -12,9 +12,9 @@ import argparse
 import time
 from pathlib import Path
 
-from groundstation.train_commands import read_flights
-from groundstation.training import recipe_named, train, with_epochs
-from groundstation.training_data import samples_of_flights
+from groundstation.commands.train import read_flights
+from groundstation.learn.training import recipe_named, train, with_epochs
+from groundstation.learn.training_data import samples_of_flights
 from models.model import rigid_body_model
 
 

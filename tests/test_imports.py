@@ -80,7 +80,7 @@ def test_a_light_process_loads_no_heavy_library(module: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["companion.inference", "companion.inspection", "groundstation.cli", "models.export"]
+    "module", ["companion.inference", "companion.inspection", "groundstation.commands.app", "models.export"]
 )
 def test_onnxruntime_tells_nobody_of_what_it_runs(module: str) -> None:
     """Its builds send events to their maker, unless told otherwise before they are loaded."""

@@ -12,10 +12,10 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from groundstation.calibration import NOTHING, OUTCOMES
+from groundstation.evaluate.calibration import NOTHING, OUTCOMES
+from groundstation.output.cited import Told, environment
 from groundstation.report.page import write_report
 from groundstation.report.svg import COLOURS, LIGHT, figure, light_style, style, to_svg
-from groundstation.report.told import Told, environment
 from models.whole_file import whole_file
 
 Table = dict[str, Any]

@@ -10,12 +10,12 @@ from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from groundstation.analysis import Analysis
+from groundstation.evaluate.analysis import Analysis
+from groundstation.evaluate.side_by_side import SideBySide
+from groundstation.evaluate.tracking import Tracking
+from groundstation.output.cited import unit
 from groundstation.report.svg import BESIDE, COLOURS, ERROR, LEVELS, figure, level, to_svg
-from groundstation.report.told import unit
 from groundstation.results import Comparison
-from groundstation.side_by_side import SideBySide
-from groundstation.tracking import Tracking
 from groundstation.views.error import rolling_rms
 
 WIDTH = 7.4

@@ -9,11 +9,11 @@ from typing import Any
 
 from markupsafe import Markup
 
-from groundstation.analysis import Analysis
+from groundstation.evaluate.analysis import Analysis
+from groundstation.evaluate.side_by_side import SideBySide
+from groundstation.output.cited import Told, environment, sentences
 from groundstation.report import charts
 from groundstation.report.svg import style
-from groundstation.report.told import Told, environment, sentences
-from groundstation.side_by_side import SideBySide
 from models.errors import InputError
 from models.whole_file import write_whole
 

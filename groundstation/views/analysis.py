@@ -8,9 +8,9 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.analysis import Analysis
-from groundstation.as_json import analysis_table
-from groundstation.report.told import Told, environment, sentences
+from groundstation.evaluate.analysis import Analysis
+from groundstation.output.as_json import analysis_table
+from groundstation.output.cited import Told, environment, sentences
 from groundstation.views.bars import bar_groups
 from groundstation.views.colour import NEWEST, WARNING, Colour, of_version
 from groundstation.views.comparison import comparison_panel

@@ -13,7 +13,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.link import Link
+from groundstation.operate.link import Link
 from groundstation.views import scene
 from groundstation.views.colour import AXES, LINEAR, MEASURED, NEWEST, REFERENCE, WARNING, Colour
 from groundstation.views.recording import TIME, recording, text

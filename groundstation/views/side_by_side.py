@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.report.told import written
-from groundstation.side_by_side import SideBySide
+from groundstation.evaluate.side_by_side import SideBySide
+from groundstation.output.cited import written
 from groundstation.views.colour import AXES, BETWEEN, LINEAR, NEWEST, REFERENCE, Colour
 from groundstation.views.error import error_curves, error_legend, error_over_time, error_path
 from groundstation.views.recording import page, recording, text

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.tracking import Tracking, told_apart
+from groundstation.evaluate.tracking import Tracking, told_apart
 from groundstation.views import scene
 from groundstation.views.bars import bar_groups
 from groundstation.views.colour import EXPECTED, NEWEST, Colour, of_version

@@ -9,9 +9,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.ablation import Ablation, Architecture
-from groundstation.training import Training
-from groundstation.training_data import Samples
+from groundstation.learn.ablation import Ablation, Architecture
+from groundstation.learn.training import Training
+from groundstation.learn.training_data import Samples
 from groundstation.views.bars import words
 from groundstation.views.colour import AXES, FLOOR, LINEAR, NEWEST, WARNING, Colour
 from groundstation.views.recording import recording, text

@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.bound import Tube
+from groundstation.evaluate.bound import Tube
 from groundstation.views import scene
 from groundstation.views.colour import FLOOR, LINEAR, NEWEST, REFERENCE
 from groundstation.views.recording import TIME, curve, recording, text, thin

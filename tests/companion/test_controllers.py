@@ -18,8 +18,8 @@ from companion.behaviour import LinearBehaviour
 from companion.control import ZERO, ControlLaw, State, euler
 from companion.controllers import Corrected, Lqr, LqrIntegral, TrimLimits, make_controller
 from companion.guard import Correction
-from groundstation.actuation import respond
-from groundstation.expected import Reference, expected_behaviour
+from groundstation.design.linear_response import Reference, expected_behaviour
+from groundstation.identify.actuation import respond
 from models import frames
 from models.design import load_design
 from models.errors import InputError

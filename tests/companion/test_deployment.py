@@ -277,7 +277,7 @@ def test_the_ground_deploys_waits_and_takes_back_from_the_command_line(
     companion: Companion, tmp_path: Path
 ) -> None:
     def ground(*arguments: object) -> subprocess.CompletedProcess[str]:
-        program = "from groundstation.cli import main; main()"
+        program = "from groundstation.commands.app import main; main()"
         line = [sys.executable, "-c", program, *map(str, arguments)]
         line += ["-e", f"tcp/127.0.0.1:{companion.zenoh_port}"]
         return subprocess.run(line, capture_output=True, text=True, timeout=60.0)

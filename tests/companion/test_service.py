@@ -16,7 +16,7 @@ from test_companion_cli import companion, refused
 
 from companion.service import CONFIG, FOLDER, SYSUSERS, UNIT
 from companion.settings import Settings, load_settings
-from groundstation.keys import make_keys
+from groundstation.operate.keys import make_keys
 
 
 def install(root: Path, *flags: object) -> dict[str, str]:

@@ -14,9 +14,9 @@ from companion.access import access_findings
 from companion.findings import DANGER, FAIL, NOTE, OK
 from companion.settings import Settings, load_settings
 from companion.zenoh_session import LOCAL, WITH_KEYS, ZenohSettings, open_session, plan_session
-from groundstation.keys import make_keys
-from groundstation.link import Link
-from groundstation.settings import Settings as GroundSettings
+from groundstation.operate.keys import make_keys
+from groundstation.operate.link import Link
+from groundstation.operate.settings import Settings as GroundSettings
 from models.access import Keys, read_keys
 from models.errors import InputError
 

@@ -11,9 +11,9 @@ from rig import VEHICLE, Bridge, Process, free_port, wait_for
 
 from companion.signature import Signatures
 from companion.store import ModelStore
-from groundstation.keys import make_keys
-from groundstation.link import Link
-from groundstation.settings import Settings
+from groundstation.operate.keys import make_keys
+from groundstation.operate.link import Link
+from groundstation.operate.settings import Settings
 from models.access import SIGNING_KEY, read_keys
 from models.contract import model_hash
 from models.errors import InputError

@@ -22,9 +22,9 @@ import zenoh
 from network_stage import HEARD, ORDER, PEOPLE, Open, Stage, free_port, tls, vehicle
 
 from companion.zenoh_session import ZenohSettings, open_session
-from groundstation.keys import make_keys
-from groundstation.link import Link, companions
-from groundstation.settings import Settings
+from groundstation.operate.keys import make_keys
+from groundstation.operate.link import Link, companions
+from groundstation.operate.settings import Settings
 from models import access
 from models.access import NEEDS, may, read_keys
 from models.contract import key, model_hash

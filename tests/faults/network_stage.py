@@ -14,9 +14,9 @@ import zenoh
 from companion.signature import Signatures
 from companion.telemetry import ATTACHED, Telemetry, read_json
 from companion.zenoh_session import ZenohSettings, open_session
-from groundstation.keys import make_keys
-from groundstation.link import Link
-from groundstation.settings import Settings
+from groundstation.operate.keys import make_keys
+from groundstation.operate.link import Link
+from groundstation.operate.settings import Settings
 from models import access
 from models.access import Keys, read_keys
 

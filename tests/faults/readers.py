@@ -26,15 +26,15 @@ from ulog_writer import TYPES, Written
 
 from companion.settings import load_settings as companion_settings
 from companion.store import live_file
-from groundstation.calibration_study import Study
+from groundstation.commands.survey import _already
+from groundstation.operate.settings import load_settings as ground_settings
 from groundstation.reading import read_flight
 from groundstation.reading.mapping import load_mapping
 from groundstation.reading.px4_log import load_ulog
-from groundstation.reproduce import _told
-from groundstation.settings import load_settings as ground_settings
-from groundstation.store import find, newest, save, versions
-from groundstation.survey_commands import _already
-from groundstation.vehicle_draft import draft_vehicle
+from groundstation.study.calibration_study import Study
+from groundstation.study.reproduce import _told
+from groundstation.versions.store import find, newest, save, versions
+from groundstation.versions.vehicle_draft import draft_vehicle
 from models.database import Collection
 from models.design import load_design
 from models.errors import InputError

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from readers import QUAD5, Reader, readers
 
-from groundstation.store import newest, save
+from groundstation.versions.store import newest, save
 from models.errors import InputError
 from models.model import Term, rigid_body_model
 from models.outside import json_object, toml_table
@@ -183,8 +183,8 @@ def _alive(pid: int) -> bool:
 @pytest.mark.parametrize("left", ["", '{"seed": 1, "scen', "[1]"])
 def test_a_reproduction_goes_on_after_a_kill(left: str, tmp_path: Path) -> None:
     """An older version left half a file; this one a hidden one, or a record that nothing was told of yet."""
-    from groundstation.reproduce import Flown, _kept
-    from groundstation.reproduce_commands import _same_study
+    from groundstation.commands.reproduce import _same_study
+    from groundstation.study.reproduce import Flown, _kept
 
     flown = Flown(1, "unseen", "lqr", (1.0, 2.0, 3.0), "finished", "")
     (tmp_path / "study.json").write_text("")

@@ -27,13 +27,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from readers import QUAD5, _columns
 
-from groundstation.calibration_study import _write as write_study
-from groundstation.effect_file import write_effect_file
+from groundstation.evaluate.survey import write_table
 from groundstation.reading import read_flight
 from groundstation.reading.writing import write_flight
 from groundstation.report.page import write_report
-from groundstation.store import newest, save, versions
-from groundstation.survey import write_table
+from groundstation.study.calibration_study import _write as write_study
+from groundstation.versions.effect_file import write_effect_file
+from groundstation.versions.store import newest, save, versions
 from models.database import Collection
 from models.design import load_design, save_design
 from models.errors import InputError

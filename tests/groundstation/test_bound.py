@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from groundstation.bound import balls_of, jumps_of, memory, predict_tube, smallest_ball, tube
-from groundstation.cli import app
-from groundstation.expected import Reference, expected_behaviour
-from groundstation.linear_design import make_design
-from groundstation.tracking import read_designed
+from groundstation.commands.app import app
+from groundstation.design.linear_design import make_design
+from groundstation.design.linear_response import Reference, expected_behaviour
+from groundstation.evaluate.bound import balls_of, jumps_of, memory, predict_tube, smallest_ball, tube
+from groundstation.evaluate.tracking import read_designed
 from models.design import load_design
 from models.errors import InputError
 from models.flight import Flight

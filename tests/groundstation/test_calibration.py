@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from simulated import VEHICLE
 
-from groundstation.as_json import calibration_table
-from groundstation.calibration import (
+from groundstation.commands.app import app
+from groundstation.evaluate.calibration import (
     ABSENT,
     MISSING,
     NOT_EXCITED,
@@ -28,9 +28,9 @@ from groundstation.calibration import (
     reliability,
     wrongs,
 )
-from groundstation.calibration_study import TOP, Study, hideable, path_of, setpoints, sorties
-from groundstation.cli import app
+from groundstation.output.as_json import calibration_table
 from groundstation.report.calibration import CHARTS, render_calibration
+from groundstation.study.calibration_study import TOP, Study, hideable, path_of, setpoints, sorties
 from models.effects import catalogue
 from models.errors import run_command_line
 from models.reference import trajectory_from_csv

@@ -14,7 +14,7 @@ import pytest
 
 from companion.telemetry import Telemetry, read_json
 from companion.zenoh_session import ZenohSettings, open_session
-from groundstation.cli import app
+from groundstation.commands.app import app
 from models.database import database
 from models.errors import run_command_line
 from models.record import read_record

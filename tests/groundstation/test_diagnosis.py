@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.diagnosis import diagnose
+from groundstation.identify.translation import diagnose
 from groundstation.reading import read_flight
 from groundstation.results import Diagnosis
 from models.model import Term, rigid_body_model

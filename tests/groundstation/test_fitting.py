@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from groundstation.compare import compare
-from groundstation.fitting import Problem, critical_value, fit
-from groundstation.measurement import measure
-from groundstation.where import where_it_fails
+from groundstation.evaluate.compare import compare
+from groundstation.evaluate.where import where_it_fails
+from groundstation.identify.fitting import Problem, critical_value, fit
+from groundstation.measured.measurement import measure
 from models.errors import InputError
 from models.flight import Flight
 from models.frames import quaternion_from_euler

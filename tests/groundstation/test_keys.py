@@ -11,8 +11,8 @@ import pytest
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from groundstation.cli import app
-from groundstation.keys import make_keys
+from groundstation.commands.app import app
+from groundstation.operate.keys import make_keys
 from models.access import may, read_keys
 from models.errors import InputError, run_command_line
 

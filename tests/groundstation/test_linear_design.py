@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from groundstation.cli import app
-from groundstation.expected import Reference, closed_loop, expected_behaviour
-from groundstation.integral_design import integral_loops, with_integral
-from groundstation.linear_design import PHASE_MARGIN, loops, make_design
-from groundstation.tracking import track
+from groundstation.commands.app import app
+from groundstation.design.integral_design import integral_loops, with_integral
+from groundstation.design.linear_design import PHASE_MARGIN, loops, make_design
+from groundstation.design.linear_response import Reference, closed_loop, expected_behaviour
+from groundstation.evaluate.tracking import track
 from models.design import design_to_json, load_design
 from models.errors import InputError, run_command_line
 from models.flight import Flight
@@ -130,7 +130,7 @@ def test_the_integral_keeps_bandwidth_and_margin_of_the_lqr(design):
 
 def test_no_other_integral_that_does_as_much_is_nearer_to_the_lqr(design):
     """Against others around it: none that is as fast, with bandwidth and margin kept, comes nearer."""
-    from groundstation.integral_design import REMAINDER, STEP, _axes, _best, _crossover, _responses
+    from groundstation.design.integral_design import REMAINDER, STEP, _axes, _best, _crossover, _responses
 
     rng = np.random.default_rng(0)
     for axis in _axes(design, VEHICLE):

@@ -17,10 +17,10 @@ import pytest
 
 from companion.telemetry import PIECE, Telemetry, make_event, read_json
 from companion.zenoh_session import ZenohSettings, open_session
-from groundstation.cli import app
-from groundstation.link import Link, companions
-from groundstation.pilot_commands import warn
-from groundstation.settings import Settings, load_settings
+from groundstation.commands.app import app
+from groundstation.commands.pilot import warn
+from groundstation.operate.link import Link, companions
+from groundstation.operate.settings import Settings, load_settings
 from models.errors import InputError, run_command_line
 from models.record_pb2 import Tick
 

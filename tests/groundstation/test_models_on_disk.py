@@ -9,9 +9,9 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from groundstation.compare import waterfall
+from groundstation.evaluate.compare import waterfall
 from groundstation.reading import read_flight
-from groundstation.store import add_effect, find, lineage, save
+from groundstation.versions.store import add_effect, find, lineage, save
 from models import contract
 from models.effect import Stage
 from models.effects import catalogue

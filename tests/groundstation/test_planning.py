@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from simulated import VEHICLE, fly
 
-from groundstation.diagnosis import diagnose
-from groundstation.planning import Limits, plan_flight, setpoints
+from groundstation.identify.planning import Limits, plan_flight, setpoints
+from groundstation.identify.translation import diagnose
 from groundstation.reading import read_flight
 from models.design import load_design
 from models.errors import InputError

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.cli import app
+from groundstation.commands.app import app
 from groundstation.reading import read_flight
 from groundstation.reading.writing import own_table
 from models.errors import run_command_line

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.diagnosis import diagnose
-from groundstation.fitting import Problem, fit
-from groundstation.measurement import measure
+from groundstation.identify.fitting import Problem, fit
+from groundstation.identify.rotors import thrust_from_rotors
+from groundstation.identify.translation import diagnose
+from groundstation.measured.measurement import measure
 from groundstation.reading import read_flight
 from groundstation.results import Diagnosis, EffectVerdict
-from groundstation.rotors import thrust_from_rotors
 from models.design import load_design
 from models.effects import catalogue, effect_named
 from models.errors import InputError

@@ -7,14 +7,14 @@ import pytest
 from scipy import signal
 from simulated import simulated
 
-from groundstation.diagnosis import diagnose
-from groundstation.effect_file import write_effect_file
-from groundstation.fitting import Problem, fit
-from groundstation.measurement import measure
-from groundstation.remainder import unexplained
+from groundstation.identify.fitting import Problem, fit
+from groundstation.identify.remainder import unexplained
+from groundstation.identify.sparse import TERMS, effect_source, unit_of
+from groundstation.identify.translation import diagnose
+from groundstation.measured.measurement import measure
 from groundstation.results import Unexplained
-from groundstation.sparse import TERMS, effect_source, unit_of
-from groundstation.store import add_effect
+from groundstation.versions.effect_file import write_effect_file
+from groundstation.versions.store import add_effect
 from models.effects import effect_named
 from models.errors import InputError
 from models.flight import Flight

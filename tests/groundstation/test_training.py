@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.ablation import ablate, inference_time
-from groundstation.compare import compare, waterfall
-from groundstation.diagnosis import diagnose
+from groundstation.commands.train import read_flights
+from groundstation.evaluate.compare import compare, waterfall
+from groundstation.identify.translation import diagnose
+from groundstation.learn.ablation import ablate, inference_time
+from groundstation.learn.training import MATERIAL_MEMORY, OWN, PAPER, memory_share, recipe_named, train
+from groundstation.learn.training_data import GAP, blocks, samples_of_flights, split
 from groundstation.reading import read_flight
-from groundstation.store import add_effect, find, lineage, save
-from groundstation.train_commands import read_flights
-from groundstation.training import MATERIAL_MEMORY, OWN, PAPER, memory_share, recipe_named, train
-from groundstation.training_data import GAP, blocks, samples_of_flights, split
+from groundstation.versions.store import add_effect, find, lineage, save
 from models.errors import InputError
 from models.export import export_onnx
 from models.model import linear_model, read_model, rigid_body_model

@@ -10,7 +10,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from groundstation.effect_commands import write_template
+from groundstation.commands.effect import write_template
 from groundstation.reading import read_flight
 from groundstation.reading.writing import write_flight
 from models.errors import InputError
@@ -33,7 +33,7 @@ def flight_with_tether(tmp_path_factory) -> Path:
 
 
 def run(*arguments: object) -> str:
-    command = [str(BIN / "python"), "-m", "groundstation.cli", *map(str, arguments)]
+    command = [str(BIN / "python"), "-m", "groundstation.commands.app", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=180)
     assert done.returncode == 0, done.stderr
     return done.stdout

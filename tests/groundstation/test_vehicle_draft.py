@@ -11,7 +11,7 @@ from px4_layouts import flown, log_of
 
 from groundstation.reading import read_flight
 from groundstation.reading.px4_log import load_ulog
-from groundstation.vehicle_draft import draft_vehicle, write_draft
+from groundstation.versions.vehicle_draft import draft_vehicle, write_draft
 from models.errors import InputError
 from models.vehicle import load_vehicle
 

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from groundstation.compare import compare, waterfall
+from groundstation.evaluate.compare import compare, waterfall
+from groundstation.evaluate.tracking import Tracking
+from groundstation.evaluate.where import where_it_fails
 from groundstation.reading import read_flight
 from groundstation.results import WhereItFails
-from groundstation.store import add_effect
-from groundstation.tracking import Tracking
+from groundstation.versions.store import add_effect
 from groundstation.views import write_before_after, write_comparison, write_tracking, write_where
 from groundstation.views.colour import of_error
 from groundstation.views.error import rolling_rms
 from groundstation.views.monitor import Monitor, state
-from groundstation.where import where_it_fails
 from models.errors import InputError
 from models.model import linear_model, rigid_body_model
 from models.record_pb2 import Event, Tick

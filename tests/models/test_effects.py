@@ -280,7 +280,7 @@ def test_gyroscopic_torque_is_the_change_of_the_rotors_momentum(rate, speeds, in
 
 
 def test_rate_loop_lag_is_a_first_order_response_after_a_delay() -> None:
-    from groundstation.actuation import respond
+    from groundstation.identify.actuation import respond
 
     dt, lag, delay = 0.002, 0.06, 0.03
     t = np.arange(300) * dt

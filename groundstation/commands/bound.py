@@ -1,0 +1,168 @@
+"""Command line of the stability bound: the tube that a flight must stay in."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from groundstation.commands.analysis import print_json
+
+if TYPE_CHECKING:
+    from groundstation.evaluate.bound import Tube
+
+console = Console()
+
+
+class AroundWhat(StrEnum):
+    """What the tube stands around."""
+
+    design = "design"
+    reference = "reference"
+
+
+MOST_LEAVINGS = 8
+PARTS: tuple[Literal["total", "model", "attitude"], ...] = ("total", "model", "attitude")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the ground station's application."""
+    app.command(
+        "bound", epilog="Example: groundstation bound flight.mcap --from earlier.mcap --save tube.rrd"
+    )(bound_command)
+
+
+def bound_command(
+    flight: Annotated[Path, typer.Argument(help="A flight with its reference: record, table or ULog.")],
+    bound_from: Annotated[
+        Path | None,
+        typer.Option("--from", help="Take the bound on d from this flight: the honest test of a prediction."),
+    ] = None,
+    design: Annotated[
+        Path | None, typer.Option("--design", help="Design file; default: that of the record.")
+    ] = None,
+    vehicle: Annotated[
+        Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
+    ] = None,
+    around: Annotated[
+        AroundWhat,
+        typer.Option("--around", help="Middle of the tube: the linear design's flight, or the reference."),
+    ] = AroundWhat.design,
+    bandwidth: Annotated[
+        float, typer.Option("--bandwidth", help="Low-pass on d and eta alike, Hz.", min=1.0)
+    ] = 5.0,
+    rrd: Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """The tube that a flight must stay in, and whether it did: the paper's stability bound in Lyapunov's form.
+
+    d is by how much the acceleration differs from what the linear design has. As long as |d| keeps below its bound,
+    the error decays into a ball around the linear design's own flight (or around the reference) and stays there.
+    """
+    from groundstation.evaluate.bound import predict_tube
+    from groundstation.evaluate.tracking import read_designed
+
+    flown, believed, label = read_designed(flight, design, vehicle)
+    source = None if bound_from is None else read_designed(bound_from, design, vehicle)[0]
+    tube = predict_tube(flown, believed, label, around.value, source, bandwidth)
+    if rrd is not None:
+        from groundstation.views import write_tube
+
+        write_tube(rrd, tube)
+    if as_json:
+        print_json(_table(tube))
+        return
+    _print(tube)
+    if rrd is not None:
+        console.print(f"Rerun recording: {escape(str(rrd))}")
+
+
+def _print(tube: Tube) -> None:
+    from rich.table import Table
+
+    d = tube.disturbance
+    beyond = "that of the linear design" if d.around == "design" else "what the position loop asks for"
+    table = Table(title=f"{escape(tube.label)}: acceleration d beyond {beyond} (m/s²)")
+    for heading in ("axis", "largest |d|", "over memory", "model alone", "attitude alone", "radius of tube"):
+        table.add_column(heading, justify="left" if heading == "axis" else "right")
+    parts = [abs(d.total).max(axis=0), *(d.radius(tube.balls, part) for part in PARTS), tube.radius]
+    for k, axis in enumerate("xyz"):
+        table.add_row(axis, *(f"{part[k]:.2f}" for part in parts))
+    console.print(table)
+    table = Table(title=f"the tube around the {d.around}, world axes")
+    for heading in ("axis", "decay", "position", "flown", "velocity", "flown ", "inside"):
+        table.add_column(heading, justify="left" if heading == "axis" else "right")
+    most, ball, inside = abs(tube.distance).max(axis=0), tube.ball, tube.inside
+    for k, axis in enumerate("xyz"):
+        table.add_row(
+            axis,
+            f"{tube.balls[k].decay:.2f} 1/s",
+            f"± {ball[k, 0]:.2f} m",
+            f"{most[k, 0]:.2f} m",
+            f"± {ball[k, 1]:.2f} m/s",
+            f"{most[k, 1]:.2f} m/s",
+            f"{100 * inside[k]:.2f} %",
+        )
+    console.print(table)
+    memories = sorted({f"{0.5 / ball.decay:.1f}" for ball in tube.balls})
+    console.print(
+        f"radius: the most that d of {escape(tube.bound_from)} has as RMS over the loop's memory of "
+        f"{' to '.join(memories)} s, below {d.bandwidth:g} Hz; the sensors resolve {tube.resolution.max():.2f} m/s²",
+        highlight=False,
+    )
+    if len(tube.jumps):
+        console.print(
+            f"the reference jumps {len(tube.jumps)} times: the tube widens there by as much", highlight=False
+        )
+    for leaving in tube.leavings[:MOST_LEAVINGS]:
+        console.print(
+            f"[yellow]leaves the tube[/yellow] in {leaving.axis} at t = {leaving.start:.2f} s, for "
+            f"{leaving.end - leaving.start:.2f} s: V^(1/2) {leaving.level:.2f} m/s², allowed {leaving.allowed:.2f}",
+            highlight=False,
+        )
+    if len(tube.leavings) > MOST_LEAVINGS:
+        console.print(f"and {len(tube.leavings) - MOST_LEAVINGS} times more", highlight=False)
+    if not tube.leavings:
+        console.print("the flight never leaves the tube")
+
+
+def _table(tube: Tube) -> dict[str, Any]:
+    d = tube.disturbance
+    most, inside = abs(tube.distance).max(axis=0), tube.inside
+    radii = {part: d.radius(tube.balls, part) for part in PARTS}
+    return {
+        "flight": tube.flight.origin,
+        "label": tube.label,
+        "seconds": round(len(tube.t) * tube.flight.dt, 2),
+        "around": d.around,
+        "bound_from": tube.bound_from,
+        "bandwidth": d.bandwidth,
+        "axes": {
+            axis: {
+                "P": tube.balls[k].P.tolist(),
+                "decay": tube.balls[k].decay,
+                "bound": float(tube.bound[k]),
+                "radius": float(tube.radius[k]),
+                "resolution": float(tube.resolution[k]),
+                "ball_position": float(tube.ball[k, 0]),
+                "ball_velocity": float(tube.ball[k, 1]),
+                "d": float(abs(d.total[:, k]).max()),
+                "d_over_memory": {part: float(radii[part][k]) for part in PARTS},
+                "flown_position": float(most[k, 0]),
+                "flown_velocity": float(most[k, 1]),
+                "flown_level": float(tube.level[:, k].max()),
+                "inside": float(inside[k]),
+            }
+            for k, axis in enumerate("xyz")
+        },
+        "units": {"decay": "1/s", "bound": "m/s^2", "radius": "m/s^2", "position": "m", "velocity": "m/s"},
+        "jumps": tube.jumps.tolist(),
+        "leavings": [
+            {"axis": w.axis, "start": w.start, "end": w.end, "level": w.level, "allowed": w.allowed}
+            for w in tube.leavings
+        ],
+    }

@@ -1,0 +1,204 @@
+"""`groundstation collect`: a training database flown by the companion, one mission after the other."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from groundstation.commands.pilot import (
+    CfgOption,
+    ConfigOption,
+    ConnectOption,
+    JsonOption,
+    KeysOption,
+    ListenOption,
+    ModeOption,
+    NameOption,
+    TimeoutOption,
+    ZenohOption,
+    check_controller,
+    link_settings,
+    warn,
+)
+from models.errors import InputError
+
+if TYPE_CHECKING:
+    from groundstation.operate.link import Link
+    from models.database import Collection, Sortie
+
+console = Console()
+
+
+def register(app: typer.Typer) -> None:
+    """Add this command to the ground station's application."""
+    app.command("collect", epilog="Example: groundstation collect --seed 1 --minutes 30 -o database")(
+        collect_command
+    )
+
+
+def collect_command(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder of the records: new, or one to continue.")
+    ],
+    seed: Annotated[int, typer.Option(help="Of the flights' order, sizes, speeds and headings.", min=0)] = 0,
+    minutes: Annotated[float, typer.Option(help="Flight time to collect, at least.")] = 30.0,
+    controller: Annotated[
+        str, typer.Option(help="lqr, lqr_integral, or corrected by the deployed model.")
+    ] = "lqr",
+    patience: Annotated[
+        float, typer.Option(help="s to wait on the ground for a companion that refuses.", min=0.0)
+    ] = 60.0,
+    config: ConfigOption = None,
+    name: NameOption = None,
+    connect: ConnectOption = None,
+    mode: ModeOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ZenohOption = None,
+    cfg: CfgOption = None,
+    timeout: TimeoutOption = None,
+    keys: KeysOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fly a whole training database through the companion and fetch each record: translations, steps, rotations,
+    spirals, circles, lemniscates, low passes and surveys.
+
+    Each flight takes off and lands. Ends early when one is not flown to its end (a pilot took over, the battery is
+    low); the same command continues with the flights that are missing, on another battery for instance.
+    """
+    check_controller(controller)
+    from groundstation.operate.link import Link
+    from models.database import Collection, database, record_name
+
+    sorties = {
+        record_name(number, sortie): sortie for number, sortie in enumerate(database(seed, minutes), 1)
+    }
+    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)
+    with Link(settings) as link:
+        warn(link)
+        asked = {"vehicle": link.vehicle, "seed": seed, "minutes": minutes, "controller": controller}
+        collection = Collection(output, {"flown_by": "groundstation collect", **asked})
+        reason = _fly_missing(link, sorties, collection, controller, patience, as_json)
+    seconds = sum(entry["seconds"] for entry in collection.flown.values())
+    if as_json:
+        report = {"folder": str(output), "wanted": len(sorties), "seconds": seconds, "reason": reason}
+        typer.echo(json.dumps({**report, "flights": collection.flown}))
+    else:
+        _print_collected(collection.flown)
+    told = f"{output}: {len(collection.flown)} of {len(sorties)} flights, {seconds / 60:.1f} min"
+    if reason:
+        raise InputError(f"{told}; ended because {reason}; the same command continues")
+    if not as_json:
+        console.print(escape(told), highlight=False)
+
+
+def _fly_missing(
+    link: Link,
+    sorties: dict[str, Sortie],
+    collection: Collection,
+    controller: str,
+    patience: float,
+    quiet: bool,
+) -> str:
+    """Fly what the collection lacks; '' when it lacks nothing any more, otherwise what came in between."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
+    with Progress(
+        *columns,
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=quiet or not console.is_terminal,
+    ) as progress:
+        total = sum(sortie.path.duration for sortie in sorties.values())
+        done = sum(entry["seconds"] for entry in collection.flown.values())
+        task = progress.add_task("", total=total, completed=done)
+        for record, sortie in sorties.items():
+            if record in collection.flown:
+                continue
+
+            def tell(what: str, flight: str = record.removesuffix(".mcap")) -> None:
+                progress.update(task, description=f"{flight}: {what}")
+
+            try:
+                entry, reason = _fly(link, sortie, controller, patience, collection.folder / record, tell)
+            except KeyboardInterrupt:
+                return f"it was interrupted (a flight under way is flown to its end: {record})"
+            if reason:
+                return reason
+            collection.add(record, entry)
+            progress.update(task, advance=sortie.path.duration)
+    return ""
+
+
+def _fly(
+    link: Link, sortie: Sortie, controller: str, patience: float, record: Path, tell: Callable[[str], None]
+) -> tuple[dict[str, Any], str]:
+    """Fly one and fetch its record; its entry and '', or nothing and the reason why it was not flown to its end."""
+    voltage = link.status()["battery_voltage"]
+    request = {"trajectory": sortie.trajectory, "parameters": sortie.parameters, "controller": controller}
+    answer, reason = _requested(link, request, patience, tell)
+    if reason:
+        return {}, reason
+
+    def tell_status(status: dict[str, Any], entry: dict[str, Any]) -> None:
+        tell(f"{status['phase']}, {status['battery_voltage']:.1f} V")
+
+    ended = link.end_of(answer["mission"], tell_status, idle=True)
+    if ended["state"] != "finished":
+        return {}, f"{sortie.trajectory} was {ended['state']}: {ended['reason']}"
+    if not ended["record"]:
+        return {}, f"{sortie.trajectory} was flown without a record; look at the companion's disk"
+    tell("fetching the record")
+    link.fetch_record(ended["record"], record.parent).replace(record)
+    entry = {
+        "trajectory": sortie.trajectory,
+        "parameters": sortie.parameters,
+        "outcome": ended["state"],
+        "seconds": sortie.path.duration,
+        "voltage": voltage,
+        "on_board": ended["record"],
+    }
+    return entry, ""
+
+
+def _requested(
+    link: Link, request: dict[str, Any], patience: float, tell: Callable[[str], None]
+) -> tuple[dict[str, Any], str]:
+    """The answer to a mission that was accepted, or the reason why it was refused for all of `patience` s.
+
+    A battery that rests after a flight recovers a little, and rates are measured again on the ground.
+    """
+    end = time.monotonic() + patience
+    while True:
+        answer = link.ask("mission", request)
+        if answer.get("accepted"):
+            return answer, ""
+        reason = str(answer.get("reason", "no reason given"))
+        if time.monotonic() > end:
+            return {}, f"the companion refused {request['trajectory']}: {reason}"
+        tell(f"waiting: {reason}")
+        time.sleep(1.0)
+
+
+def _print_collected(flown: dict[str, dict[str, Any]]) -> None:
+    """One row for each trajectory: how often, how long, on which batteries."""
+    from rich.table import Table
+
+    table = Table()
+    for column in ("trajectory", "flights", "s", "battery before (V)"):
+        table.add_column(column, justify="left" if column == "trajectory" else "right", no_wrap=True)
+    for name in sorted({entry["trajectory"] for entry in flown.values()}):
+        of = [entry for entry in flown.values() if entry["trajectory"] == name]
+        volts = [entry["voltage"] for entry in of]
+        seconds = sum(entry["seconds"] for entry in of)
+        table.add_row(name, str(len(of)), f"{seconds:.0f}", f"{min(volts):.1f} to {max(volts):.1f}")
+    if flown:
+        console.print(table)

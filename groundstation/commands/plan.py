@@ -1,0 +1,172 @@
+"""`groundstation plan-flight`: the short flight that tells apart what a diagnosis left open."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from groundstation.commands.analysis import (
+    DEFAULT_STORE,
+    EffectsOption,
+    JsonOption,
+    MappingOption,
+    ModelOption,
+    StoreOption,
+    VehicleOption,
+    print_json,
+)
+from models.errors import InputError
+from models.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from groundstation.identify.planning import FlightPlan
+    from models.design import Design
+    from models.vehicle import Vehicle
+
+console = Console()
+
+
+def register(app: typer.Typer) -> None:
+    """Add this command to the ground station's application."""
+    app.command(
+        "plan-flight",
+        epilog="Example: groundstation plan-flight flight.mcap --between wind --between rotor_drag -o plan.csv",
+    )(plan_command)
+
+
+def plan_command(
+    flight: Annotated[
+        Path | None,
+        typer.Argument(help="A flight whose diagnosis left something open; its noise is taken, too."),
+    ] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The setpoints to write.")] = Path(
+        "plan.csv"
+    ),
+    between: Annotated[
+        list[str] | None, typer.Option("--between", help="An effect to tell from the others. Repeatable.")
+    ] = None,
+    vehicle: VehicleOption = None,
+    design: Annotated[
+        Path | None,
+        typer.Option(help="Design file; default: the record's, or design.json beside the vehicle."),
+    ] = None,
+    mapping: MappingOption = None,
+    model: ModelOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    effects: EffectsOption = None,
+    radius: Annotated[float, typer.Option(help="m around home.", min=0.5)] = 3.0,
+    low: Annotated[float, typer.Option(help="Lowest height above ground, m.", min=0.05)] = 0.4,
+    high: Annotated[float, typer.Option(help="Greatest height, m.", min=0.8)] = 2.5,
+    speed: Annotated[float, typer.Option(help="Greatest speed, m/s.", min=0.3)] = 3.0,
+    acceleration: Annotated[float, typer.Option(help="Greatest acceleration, m/s².", min=0.5, max=9.0)] = 5.0,
+    duration: Annotated[float, typer.Option(help="Longest flight, s.", min=8.0)] = 40.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Design the short flight that best separates the remaining candidates, and say what it will resolve.
+
+    The file is flown like any table of setpoints: `groundstation fly plan.csv`, `sim-bridge fly --trajectory plan.csv`.
+    """
+    from groundstation.commands.remainder import base_for_diagnosis
+    from groundstation.identify.planning import Limits, plan_flight, setpoints
+    from groundstation.identify.translation import diagnose
+    from groundstation.output.as_json import plain
+    from groundstation.reading import read_flight
+    from models.vehicle import load_vehicle
+
+    limits = Limits(radius, low, high, speed, acceleration, duration)
+    directory = None if effects is None else str(effects)
+    diagnosis = None
+    with nullcontext() if as_json else console.status("reading") as status:
+
+        def progress(text: str) -> None:
+            if status is not None:
+                status.update(text)
+
+        if flight is not None:
+            read = read_flight(flight, vehicle, mapping)
+            believed = read.vehicle
+            base = base_for_diagnosis(model, read, store, effects)
+            diagnosis = diagnose(read, base, progress=progress)
+        elif vehicle is not None:
+            believed = load_vehicle(vehicle)
+        else:
+            raise InputError("pass a flight, or --vehicle with --between")
+        gains = _design(design, believed, flight)
+        plan = plan_flight(gains, believed, limits, diagnosis, between or (), directory, progress)
+    write_whole(output, setpoints(plan.trajectory), "the plan", "choose another -o")
+    if as_json:
+        print_json(
+            plain(
+                {
+                    "path": str(output),
+                    "duration": plan.trajectory.duration,
+                    "manoeuvres": plan.manoeuvres,
+                    "questions": [{**asdict(q), "answered": q.answered} for q in plan.questions],
+                    "precision": [asdict(p) for p in plan.precision],
+                    "left_out": plan.left_out,
+                }
+            )
+        )
+        return
+    _print(plan, output)
+
+
+def _design(given: Path | None, vehicle: Vehicle, flight: Path | None) -> Design:
+    """The design that will fly: the one given, the record's own, or the one beside the vehicle file."""
+    from models.design import load_design
+    from models.record import read_record
+
+    if given is not None:
+        return load_design(given, vehicle)
+    if flight is not None and flight.suffix.lower() == ".mcap":
+        recorded = read_record(flight).design
+        if recorded is not None:
+            return recorded
+    beside = Path(vehicle.source).with_name("design.json") if vehicle.source else Path("design.json")
+    if not beside.is_file():
+        raise InputError(f"{beside}: no design to predict the flight by; pass --design FILE")
+    return load_design(beside, vehicle)
+
+
+def _print(plan: FlightPlan, output: Path) -> None:
+    from rich.table import Table
+
+    low, high = plan.trajectory.bounds
+    console.print(
+        f"[bold]{output}[/bold]: {plan.trajectory.duration:.0f} s, x {low[0]:.1f} to {high[0]:.1f} m, "
+        f"y {low[1]:.1f} to {high[1]:.1f} m, z {low[2]:.1f} to {high[2]:.1f} m, up to "
+        f"{plan.trajectory.max_speed:.1f} m/s and {plan.trajectory.max_acceleration:.1f} m/s²",
+        highlight=False,
+    )
+    for text in plan.manoeuvres:
+        console.print(f"  {text}", highlight=False)
+    table = Table(
+        title="what it will tell (evidence above 6 tells two explanations apart)", title_justify="left"
+    )
+    for column in ("if it is", "and not", "evidence so far", "expected", ""):
+        table.add_column(column, justify="right" if column[:1] == "e" else "left")
+    for q in plan.questions:
+        table.add_row(
+            " with ".join(q.one),
+            " with ".join(q.other) or "nothing",
+            "" if q.before is None else f"{q.before:.0f}",
+            f"{q.after:.0f}",
+            "[green]told apart[/green]" if q.answered else "[red]stays open[/red]",
+        )
+    console.print(table)
+    table = Table(title="half width of the 95 % intervals", title_justify="left")
+    for column in ("effect", "parameter", "size planned for", "so far", "expected"):
+        table.add_column(column, justify="left" if column in ("effect", "parameter") else "right")
+    for p in plan.precision:
+        unit = "" if p.unit == "1" else f" {p.unit}"
+        before = "" if p.before is None else f"± {p.before:.2g}"
+        table.add_row(p.effect, p.parameter, f"{p.value:.3g}{unit}", before, f"± {p.after:.2g}")
+    console.print(table)
+    for name, why in plan.left_out.items():
+        console.print(f"{name}: {why}", style="yellow")
+    console.print(f"fly it: groundstation fly {output}", highlight=False)

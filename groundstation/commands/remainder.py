@@ -1,0 +1,160 @@
+"""`groundstation remainder`: what no effect of the catalogue explains, and a file that makes an effect of it."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from groundstation.commands.analysis import (
+    DEFAULT_STORE,
+    BandwidthOption,
+    EffectsOption,
+    FlightArgument,
+    JsonOption,
+    MappingOption,
+    ModelOption,
+    StoreOption,
+    VehicleOption,
+    chosen_model,
+    print_json,
+)
+from models.errors import InputError
+
+if TYPE_CHECKING:
+    from groundstation.results import Diagnosis, Unexplained
+    from models.flight import Flight
+    from models.model import Model
+
+console = Console()
+
+
+def register(app: typer.Typer) -> None:
+    """Add this command to the ground station's application."""
+    app.command(
+        "remainder", epilog="Example: groundstation remainder flight.mcap --write effects --name side_force"
+    )(remainder_command)
+
+
+def base_for_diagnosis(which: str | None, flight: Flight, store: Path, effects: Path | None) -> Model:
+    """The model asked for, as one that a diagnosis can start from: with exact rotation."""
+    from models.model import rigid_body_model
+
+    base = chosen_model(which, flight, store, effects)
+    if "rigid_body" in base.names():
+        return base
+    if base.network is not None:
+        raise InputError(
+            f"the network of {base.label} was trained beside the linear model; pass --model with a version that has "
+            "rigid_body, or --model linear"
+        )
+    return rigid_body_model(flight.vehicle, base.effects_directory)
+
+
+def remainder_command(
+    flight: FlightArgument,
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
+    model: ModelOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    effects: EffectsOption = None,
+    bandwidth: BandwidthOption = None,
+    write: Annotated[
+        Path | None, typer.Option("--write", help="Folder for the formula, as an effect of your own.")
+    ] = None,
+    name: Annotated[str, typer.Option("--name", help="Name of that effect.")] = "remainder",
+    as_json: JsonOption = False,
+) -> None:
+    """What is left after every effect that the flight supports: where, when, which frequency, and a short formula.
+
+    `--write` makes the formula an effect: `groundstation model add NAME --effects DIR` takes it.
+    """
+    from groundstation.identify.sparse import effect_source
+    from groundstation.identify.translation import diagnose
+    from groundstation.output.as_json import plain
+    from groundstation.reading import read_flight
+    from groundstation.versions.effect_file import write_effect_file
+
+    read = read_flight(flight, vehicle, mapping)
+    base = base_for_diagnosis(model, read, store, effects)
+    with nullcontext() if as_json else console.status("explaining what can be explained"):
+        result = diagnose(read, base, bandwidth=bandwidth)
+    left, path = result.unexplained, None
+    if write is not None:
+        if left.formula is None:
+            raise InputError(
+                f"{read.name}: no short formula holds what is left; "
+                + (left.advice or "nothing but noise is left of this flight")
+            )
+        source = effect_source(left.formula, name, read.name, read.data_hash)
+        path = write_effect_file(name, source, write)
+    if as_json:
+        print_json(plain(_table(result, path)))
+        return
+    _print(left, result, path, flight)
+
+
+def _table(d: Diagnosis, path: Path | None) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return {
+        "flight": d.flight.name,
+        "explained_by": list(d.model.names()),
+        "residual_rms": {"value": d.rms_after, "noise_floor": d.noise_floor, "unit": "m/s^2"},
+        "unexplained": asdict(d.unexplained),
+        "written": None if path is None else str(path),
+    }
+
+
+def _print(left: Unexplained, d: Diagnosis, path: Path | None, flight: Path) -> None:
+    from rich.table import Table
+
+    from groundstation.identify.sparse import written
+    from groundstation.output.tables import percent
+
+    console.print(
+        f"{d.flight.name}: explained by {', '.join(d.model.names())}; left are {d.rms_after:.3f} m/s² "
+        f"(noise floor {d.noise_floor:.3f})",
+        highlight=False,
+    )
+    if not left.verdict:
+        console.print("nothing in it can be predicted", style="bold green")
+    else:
+        console.print(
+            f"none of these explains the rest: {percent(left.variance_share)} of it can be predicted on held-out parts "
+            f"(by chance with a probability of at most {left.p_value:.2g})",
+            style="bold yellow",
+        )
+    for text in left.where:
+        console.print(f"  {text}", highlight=False)
+    if left.axes:
+        shares = ", ".join(f"{axis} {percent(share)}" for axis, share in left.axes.items())
+        console.print(f"  body axes: {shares}", highlight=False)
+    for start, end, share in left.moments:
+        console.print(f"  {start:6.1f} to {end:.1f} s  {percent(share)} of it", highlight=False)
+    if left.lines:
+        table = Table(title="lines of the spectrum", title_justify="left")
+        for column in ("Hz", "axis", "RMS m/s²", "what it may be"):
+            table.add_column(column, justify="left" if column.startswith(("a", "w")) else "right")
+        for line in left.lines:
+            table.add_row(f"{line.frequency:.2f}", line.axis, f"{line.rms:.3f}", line.text)
+        console.print(table)
+    if left.formula is not None:
+        console.print("[bold]formula[/bold], body axes", highlight=False)
+        for t in left.formula.terms:
+            unit = "" if t.unit == "1" else f" {t.unit}"
+            console.print(
+                f"  a_{t.axis}: {t.coefficient:.4g}{unit} times {written(t.term)}   95 %: {t.low:.4g} to {t.high:.4g}",
+                highlight=False,
+            )
+    if path is not None:
+        console.print(f"{path}: add it with", highlight=False)
+        console.print(
+            f"  groundstation model add {path.stem} --flight {flight} --effects {path.parent}",
+            highlight=False,
+        )
+    elif left.advice:
+        console.print(left.advice.replace("FLIGHT", str(flight)), highlight=False)

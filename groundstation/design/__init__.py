@@ -1,0 +1,1 @@
+"""Gains of the linear cascade, and the linear behaviour that they promise."""

@@ -1,0 +1,1 @@
+"""Which physical effects are missing: fits, searches and what remains unexplained."""

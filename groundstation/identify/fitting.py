@@ -1,0 +1,460 @@
+"""Fitting the parameters of a chain of effects to flights, with intervals that hold under correlated residuals.
+
+Least squares on specific force, body axes, every axis with the same weight, with a weak prior at "no effect" for each
+parameter (two typical sizes wide, worth one independent sample): it decides only what the data leave open, such as
+thrust gain against accelerometer bias in a hover. Residuals of flight data at 100 Hz are
+strongly autocorrelated, so ordinary intervals would be far too narrow: covariances here are Newey-West with a
+Bartlett kernel of `HAC_LAG` s, and critical values are the fixed-b ones of Kiefer and Vogelsang (2005), "A new
+asymptotic theory for heteroskedasticity-autocorrelation robust tests", Econometric Theory 21, table 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import optimize, stats
+from statsmodels.stats.sandwich_covariance import S_hac_simple
+
+from groundstation.measured.measurement import Measurement
+from models.effect import Effect, Motion, Parameter, Stage
+from models.effects import effect_named
+from models.model import Model, Term
+from models.prediction import Chain, act, motion_of_flight, specific_force
+from models.vehicle import Vehicle
+
+HAC_LAG = 2.0
+"""s of Bartlett kernel: beyond the slowest correlation that a position-controlled quadrotor shows."""
+UNMODELLED = 0.02
+"""m/s²: slow model error that every flight is granted, for the weight of the prior: 2 mg, the bias stability of a
+MEMS accelerometer."""
+BLOCK = 5.0
+"""s of each held-out block."""
+
+
+@dataclass(frozen=True)
+class Free:
+    """One free number of a fit: a parameter of an effect, its start and its bounds."""
+
+    effect: str
+    parameter: Parameter
+    start: float
+    low: float
+    high: float
+    neutral: float
+    tolerance: float = 0.0
+    nuisance: bool = False
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the prior: two typical sizes, or half the range where no value is "no effect"."""
+        if self.parameter.structural:
+            return 0.5 * (self.parameter.high - self.parameter.low)
+        return max(2.0 * abs(self.parameter.typical - self.neutral), 1e-6)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Measured flights and, for each, the motion that effects act on.
+
+    `always` acts in every prediction and is never fitted: the network of a model.
+    """
+
+    measurements: tuple[Measurement, ...]
+    effects_directory: str | None = None
+    always: Chain = ()
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle of the flights."""
+        return self.measurements[0].flight.vehicle
+
+    def predict(self, chain: Sequence[tuple[Effect, Mapping[str, float]]]) -> np.ndarray:
+        """Predicted specific force (K, A) of the used samples of all flights, behind each flight's filter."""
+        parts = []
+        for m, motion in zip(self.measurements, self.motions, strict=True):
+            force = m.see(specific_force(act(motion, [*chain, *self.always])))
+            parts.append(force[m.used][:, m.axes])
+        return np.concatenate(parts)
+
+    @cached_property
+    def motions(self) -> tuple[Motion, ...]:
+        """Each flight as effects see it, before any of them acts."""
+        return tuple(motion_of_flight(m.flight) for m in self.measurements)
+
+    @cached_property
+    def survey(self) -> Motion:
+        """What tells where the flights went: the motion that reached highest."""
+        heights = [-np.inf if m.height is None else float(np.max(m.height)) for m in self.motions]
+        return self.motions[int(np.argmax(heights))]
+
+    def measured(self) -> np.ndarray:
+        """Measured specific force (K, A) of the used samples."""
+        return np.concatenate([m.value[m.used][:, m.axes] for m in self.measurements])
+
+    def unit(self) -> float:
+        """Squared error worth one independent sample, (m/s²)²: noise and unmodelled error over the correlation time."""
+        m = self.measurements[0]
+        rate = 1.0 / float(np.median(np.diff(m.t)))
+        noise = float(np.mean(m.noise[list(m.axes)] ** 2))
+        return noise + UNMODELLED**2 * max(1.0, HAC_LAG * rate)
+
+    def blocks(self) -> np.ndarray:
+        """Number of the held-out block of each used sample (K,)."""
+        numbers, offset = [], 0
+        for m in self.measurements:
+            block = ((m.t[m.used] - m.t[0]) / BLOCK).astype(int)
+            _, block = np.unique(block, return_inverse=True)
+            numbers.append(block + offset)
+            offset += int(block.max()) + 1
+        return np.concatenate(numbers)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted chain.
+
+    `values` by effect and parameter; `free` the P fitted numbers, `estimate` (P,) theirs, `covariance` (P, P);
+    `jacobian` (K, A, P) and `residual` (K, A) at the optimum; `critical` the two-sided 95 % factor of `covariance`.
+    """
+
+    terms: tuple[Term, ...]
+    free: tuple[Free, ...]
+    estimate: np.ndarray
+    covariance: np.ndarray
+    critical: float
+    jacobian: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def surprise(self) -> float:
+        """How far the parameters are from "no effect", in squared standard deviations of the prior."""
+        return float(
+            sum(((x - f.neutral) / f.spread) ** 2 for x, f in zip(self.estimate, self.free, strict=True))
+        )
+
+    @property
+    def sse(self) -> float:
+        """Sum of squared residuals, (m/s²)²."""
+        return float(np.sum(self.residual**2))
+
+    def of(self, effect: str) -> list[int]:
+        """Columns of the free numbers that belong to `effect`."""
+        return [i for i, f in enumerate(self.free) if f.effect == effect and not f.nuisance]
+
+    def sizes(self, effect: str) -> list[int]:
+        """Those of them that have a value of "no effect"."""
+        return [i for i in self.of(effect) if not self.free[i].parameter.structural]
+
+    def interval(self, index: int) -> tuple[float, float]:
+        """95 % interval of one free number."""
+        half = half_width(
+            self.free[index], float(self.estimate[index]), self.covariance[index, index], self.critical
+        )
+        return float(self.estimate[index] - half), float(self.estimate[index] + half)
+
+    def wald(self, effect: str) -> float:
+        """p-value that all parameters of `effect` are neutral, from the robust covariance.
+
+        The fixed-b factor of one number is applied to the statistic as a whole.
+        """
+        columns = self.sizes(effect)
+        if not columns:
+            return 1.0
+        neutral = np.array([self._neutral(i) for i in columns])
+        difference = self.estimate[columns] - neutral
+        covariance = self.covariance[np.ix_(columns, columns)]
+        statistic = float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
+        return float(stats.chi2.sf(statistic * (1.96 / self.critical) ** 2, len(columns)))
+
+    def _neutral(self, index: int) -> float:
+        """Value without effect; for a delay the nearest that the clock's tolerance allows."""
+        free = self.free[index]
+        return float(
+            np.clip(self.estimate[index], free.neutral - free.tolerance, free.neutral + free.tolerance)
+        )
+
+
+CLOCK = {"transport_delay": 1.0, "motor_lag": 0.5}
+"""Samples by which no log tells a delay and a lag: columns are aligned to one, and a command that is held for a sample
+looks, between samples, like one that is half a sample late and smoothed."""
+
+
+SCALE = 0.005
+"""Relative 95 % uncertainty of every value, however well a fit is conditioned: sensitivity tolerance of a MEMS
+accelerometer or gyroscope (TDK ICM-42688-P datasheet: 0.5 %). No law of the catalogue is truer either."""
+
+
+def half_width(free: Free, value: float, variance: float, critical: float) -> float:
+    """Half of a 95 % interval around `value`, never below what clock and scale of the sensors allow."""
+    scale = 0.0 if free.parameter.structural else SCALE * value
+    return float(np.hypot(critical * np.sqrt(max(variance, 0.0)), scale)) + free.tolerance
+
+
+def critical_value(duration: float) -> float:
+    """Two-sided 95 % factor for a Bartlett kernel of `HAC_LAG` over `duration` s (Kiefer & Vogelsang 2005)."""
+    b = min(1.0, HAC_LAG / max(duration, HAC_LAG))
+    return 1.9600 + 2.9694 * b + 0.4160 * b**2 - 0.5324 * b**3
+
+
+def free_parameters(
+    effect: Effect, motion: Motion, start: Mapping[str, float] | None = None, period: float = 0.0
+) -> list[Free]:
+    """The numbers of `effect` to fit to a flight, on a clock of `period` s.
+
+    Bounds reach a little beyond the plausible range, so that data may contradict
+    the effect instead of resting on its bound."""
+    free = []
+    sizes = effect.typical(motion)
+    for p in effect.parameters:
+        typical = sizes[p.name]
+        neutral = typical if p.structural else p.neutral_for(motion.vehicle)
+        within = effect.stage is Stage.COMMAND or p.even or p.structural
+        margin = 0.0 if within else 2.0 * abs(p.typical - neutral)
+        value = (start or {}).get(p.name, neutral + 0.3 * (typical - neutral))
+        low, high = p.low - margin, p.high + margin
+        tolerance = period * CLOCK.get(effect.name, 0.0)
+        value = float(np.clip(value, low + 1e-9, high - 1e-9))
+        free.append(Free(effect.name, p, value, low, high, neutral, tolerance))
+    return free
+
+
+def fit(
+    problem: Problem,
+    terms: Sequence[Term],
+    refit: Sequence[str] | None = None,
+    clock: bool = True,
+    tolerance: float = 1e-6,
+) -> Fit:
+    """Fit the parameters of `terms` (all of them, or the effects named in `refit`) to the flights.
+
+    With `clock`, the delay between the columns is free within one sample of what the vehicle file says: no log's
+    clock is better than that, and a shift must not be taken for drag.
+    """
+    vehicle, names = problem.vehicle, [t.effect for t in terms]
+    fixed = {t.effect: dict(t.values) for t in terms}
+    free: list[Free] = []
+    period = max(m.flight.dt for m in problem.measurements)
+    for term in terms:
+        effect = effect_named(term.effect, problem.effects_directory)
+        if (refit is None or term.effect in refit) and not effect.rotational:
+            free += free_parameters(effect, problem.survey, term.values or None, period)
+    chain_names = list(names)
+    if clock and "transport_delay" not in names:
+        parameter, believed = effect_named("transport_delay").parameters[0], vehicle.command_delay
+        low, high = max(0.0, believed - period), believed + period
+        free.append(Free("transport_delay", parameter, believed, low, high, believed, period, nuisance=True))
+        chain_names.append("transport_delay")
+    effects = [effect_named(n, problem.effects_directory) for n in chain_names]
+    measured = problem.measured()
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        values = {name: dict(fixed.get(name, {})) for name in chain_names}
+        for f, value in zip(free, x, strict=True):
+            values[f.effect][f.parameter.name] = float(value)
+        return (measured - problem.predict([(e, values[e.name]) for e in effects])).ravel()
+
+    weight = np.sqrt(problem.unit()) / np.array([f.spread for f in free])
+    neutral = np.array([f.neutral for f in free])
+    if free:
+        estimate, flat, jacobian = _minimise(residual, free, weight, neutral, tolerance)
+    else:
+        estimate, flat, jacobian = np.zeros(0), residual(np.zeros(0)), np.zeros((measured.size, 0))
+    k, a = measured.shape
+    shaped = jacobian.reshape(k, a, len(free))
+    covariance, critical = robust_covariance(problem, shaped, flat.reshape(k, a), weight)
+    values = {name: dict(fixed.get(name, {})) for name in chain_names}
+    intervals: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in chain_names}
+    for i, f in enumerate(free):
+        half = half_width(f, float(estimate[i]), covariance[i, i], critical)
+        values[f.effect][f.parameter.name] = float(estimate[i])
+        intervals[f.effect][f.parameter.name] = (float(estimate[i] - half), float(estimate[i] + half))
+    fitted = tuple(
+        Term(name, values[name], intervals[name] or (terms[i].intervals if i < len(terms) else {}))
+        for i, name in enumerate(chain_names)
+    )
+    return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a))
+
+
+def _minimise(
+    residual: Callable[[np.ndarray], np.ndarray],
+    free: Sequence[Free],
+    weight: np.ndarray,
+    neutral: np.ndarray,
+    tolerance: float,
+    most: int = 25,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bounded Levenberg-Marquardt (Nocedal & Wright, Numerical Optimization, 2nd ed., ch. 10): estimate, residual there
+    and Jacobian beside it.
+
+    Nearly all effects are linear in their parameters, so that two steps are enough; a step that meets a bound is taken
+    again with that number held.
+    """
+    low = np.array([f.low for f in free])
+    high = np.array([max(f.high, f.low + 1e-9) for f in free])
+    spread = np.array([f.spread for f in free])
+    x = np.clip(np.array([f.start for f in free]), low, high)
+    flat = residual(x)
+
+    def cost_of(x: np.ndarray, flat: np.ndarray) -> float:
+        return float(flat @ flat + np.sum((weight * (x - neutral)) ** 2))
+
+    cost, damping = cost_of(x, flat), 1e-8
+    jacobian = _jacobian(residual, x, free, flat)
+    for _ in range(most):
+        normal = jacobian.T @ jacobian + np.diag(weight**2)
+        slope = jacobian.T @ flat + weight**2 * (x - neutral)
+        moved = False
+        for _ in range(8):
+            step = _bounded_step(normal + damping * np.diag(np.diag(normal)), slope, x, low, high)
+            tried = residual(x + step)
+            there = cost_of(x + step, tried)
+            if there <= cost:
+                moved = True
+                break
+            damping = max(damping, 1e-6) * 30.0
+        if not moved:
+            break
+        gained = cost - there
+        x, flat, cost, damping = x + step, tried, there, damping / 10.0
+        small = gained < tolerance * cost or bool(np.all(np.abs(step) < 1e-5 * spread))
+        if small and bool(np.all(np.abs(step) < 0.05 * spread)):
+            break
+        jacobian = _jacobian(residual, x, free, flat)
+        if small:
+            break
+    return x, flat, jacobian
+
+
+def _bounded_step(
+    normal: np.ndarray, slope: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """The step to the minimum of a quadratic within bounds, by holding what runs into one."""
+    step = np.zeros_like(x)
+    loose = np.ones(len(x), dtype=bool)
+    for _ in range(len(x)):
+        inner = normal[np.ix_(loose, loose)]
+        rest = slope[loose] + normal[np.ix_(loose, ~loose)] @ step[~loose]
+        step[loose] = -np.linalg.lstsq(inner, rest, rcond=1e-14)[0]
+        over = loose & ((x + step < low) | (x + step > high))
+        if not over.any():
+            break
+        step[over] = np.clip(x + step, low, high)[over] - x[over]
+        loose &= ~over
+        if not loose.any():
+            break
+    return step
+
+
+def _jacobian(
+    residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, free: Sequence[Free], base: np.ndarray
+) -> np.ndarray:
+    """Forward differences with steps of a hundredth of each prior's width, away from the upper bound."""
+    columns = np.empty((base.size, len(x)))
+    for i, f in enumerate(free):
+        step = 0.01 * f.spread
+        if x[i] + step > f.high:
+            step = -step
+        moved = x.copy()
+        moved[i] += step
+        columns[:, i] = (residual(moved) - base) / step
+    return columns
+
+
+def robust_covariance(
+    problem: Problem, jacobian: np.ndarray, residual: np.ndarray, prior: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Newey-West sandwich covariance (P, P) of least squares with `jacobian` (K, A, P), `residual` (K, A) and weights
+    `prior` (P,) of the prior's rows, and its fixed-b factor for 95 %."""
+    k, a, p = jacobian.shape
+    flat = jacobian.reshape(k * a, p)
+    pull = np.diag(prior**2)
+    bread = np.linalg.pinv(flat.T @ flat + pull, hermitian=True)
+    scores = np.einsum("kap,ka->kp", jacobian, residual)
+    meat, offset, seconds = pull * problem.unit(), 0, 0.0
+    for m in problem.measurements:
+        # the samples in their places in time, with zeros for those left out, so that lags are lags
+        placed = np.zeros((len(m.t), p))
+        placed[m.used] = scores[offset : offset + int(m.used.sum())]
+        period = float(np.median(np.diff(m.t)))
+        if p:
+            meat += S_hac_simple(placed, nlags=max(1, round(HAC_LAG / period)))
+        offset += int(m.used.sum())
+        seconds += float(m.used.sum()) * period
+    covariance = bread @ meat @ bread * (k / max(k - p, 1))
+    return covariance, critical_value(seconds)
+
+
+def long_run_variance(problem: Problem, residual: np.ndarray) -> float:
+    """Variance of `residual` (K, A) that counts for slow regressors: Bartlett kernel of `HAC_LAG` s, mean over axes,
+    and never less than the plain mean square."""
+    total, offset = 0.0, 0
+    for m in problem.measurements:
+        count = int(m.used.sum())
+        placed = np.zeros((len(m.t), residual.shape[1]))
+        placed[m.used] = residual[offset : offset + count]
+        lag = max(1, round(HAC_LAG / float(np.median(np.diff(m.t)))))
+        sums = np.cumsum(np.pad(placed, ((lag, lag), (0, 0))), axis=0)
+        total += float(np.sum((sums[lag:] - sums[:-lag]) ** 2)) / lag
+        offset += count
+    return max(total, float(np.sum(residual**2))) / residual.size
+
+
+def with_clock(measurement: Measurement, chain: Chain) -> Chain:
+    """The chain with the delay between the flight's columns set as well as one sample of freedom allows.
+
+    A shift of the clock belongs to a log, not to a model: every comparison finds it anew.
+    """
+    if any(effect.name == "transport_delay" for effect, _ in chain):
+        return chain
+    problem, delay = Problem((measurement,)), effect_named("transport_delay")
+    believed, period = problem.vehicle.command_delay, measurement.flight.dt
+    measured = problem.measured()
+
+    def error(value: float) -> float:
+        return float(np.sum((measured - problem.predict([*chain, (delay, {"delay": value})])) ** 2))
+
+    found = optimize.minimize_scalar(
+        error,
+        bounds=(max(0.0, believed - period), believed + period),
+        method="bounded",
+        options={"xatol": 0.02 * period},
+    )
+    return [*chain, (delay, {"delay": float(found.x)})]
+
+
+def block_errors(fit_: Fit, blocks: np.ndarray) -> np.ndarray:
+    """Sum of squared residuals of each block (B,), predicted by parameters fitted without that block.
+
+    One Gauss-Newton step from the common optimum, exact for effects that are linear in their parameters; those that say
+    where an effect acts are far from it, and stay.
+    """
+    count = int(blocks.max()) + 1
+    moved = [i for i, f in enumerate(fit_.free) if not f.parameter.structural]
+    p = len(moved)
+    augmented = np.concatenate([fit_.jacobian[:, :, moved], fit_.residual[:, :, None]], axis=2)
+    gram = np.zeros((count, p + 1, p + 1))
+    for b in range(count):
+        part = augmented[blocks == b].reshape(-1, p + 1)
+        gram[b] = part.T @ part
+    total = gram.sum(axis=0)
+    errors = np.empty(count)
+    bounds_low = np.array([fit_.free[i].low for i in moved]) - fit_.estimate[moved]
+    bounds_high = np.array([fit_.free[i].high for i in moved]) - fit_.estimate[moved]
+    for b in range(count):
+        rest = total - gram[b]
+        # residual(x + d) is about residual + J d
+        step = -np.linalg.lstsq(
+            rest[:p, :p] + 1e-9 * np.diag(np.diag(rest[:p, :p]) + 1e-12), rest[:p, p], rcond=None
+        )[0]
+        step = np.clip(step, bounds_low, bounds_high)
+        errors[b] = gram[b, p, p] + 2 * step @ gram[b, :p, p] + step @ gram[b, :p, :p] @ step
+    return errors
+
+
+def model_of(fit_: Fit, base: Model) -> Model:
+    """The base model with the fitted terms; the clock's shift, a nuisance, stays out."""
+    nuisance = {f.effect for f in fit_.free if f.nuisance}
+    return base.with_terms(tuple(t for t in fit_.terms if t.effect not in nuisance))

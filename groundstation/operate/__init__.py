@@ -1,0 +1,1 @@
+"""The ground's end of the wire: Zenoh link, keys, settings, other programs started and ended."""

@@ -1,0 +1,193 @@
+"""What the analyses look like in a terminal of 100 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from groundstation.evaluate.side_by_side import SideBySide
+from groundstation.results import Comparison, Diagnosis, EffectVerdict, WaterfallStep, WhereItFails
+
+VERDICT_STYLE = {
+    "missing": "bold red",
+    "possible": "yellow",
+    "included": "green",
+    "not_excited": "cyan",
+    "not_supported": "dim",
+}
+SAID = {
+    "missing": "MISSING",
+    "possible": "possible",
+    "included": "in the model",
+    "not_excited": "not excited",
+    "not_supported": "not supported",
+}
+
+
+def percent(share: float) -> str:
+    """A share as people read it: 71 %, 0.4 %."""
+    return f"{100 * share:.0f} %" if share >= 0.01 or share == 0.0 else f"{100 * share:.1f} %"
+
+
+def print_comparisons(console: Console, comparisons: Sequence[Comparison]) -> None:
+    """Residual per axis and open-loop error, one row a model."""
+    first = comparisons[0]
+    table = Table(
+        title=f"{first.flight.name}: measured minus predicted acceleration, RMS in m/s², heading frame, "
+        f"below {first.bandwidth:g} Hz",
+        title_justify="left",
+    )
+    table.add_column("model", no_wrap=True)
+    for a in first.axes:
+        table.add_column(a.axis, justify="right")
+        table.add_column("expl.", justify="right", no_wrap=True)
+    for h in first.horizons:
+        table.add_column(f"{h.horizon:g} s", justify="right", no_wrap=True)
+    for c in comparisons:
+        cells = [c.label]
+        for a in c.axes:
+            cells += [f"{a.rms:.3f}", percent(a.share_explained)]
+        cells += [f"{100 * sum(x * x for x in h.position) ** 0.5:.1f} cm" for h in c.horizons]
+        table.add_row(*cells)
+    cells = ["noise floor"]
+    for a in first.axes:
+        cells += [f"{a.noise_floor:.3f}", ""]
+    table.add_row(*cells, *([""] * len(first.horizons)), style="dim")
+    console.print(table)
+    told = "expl.: share of the linear model's squared error above the noise floor that is explained"
+    if first.horizons:
+        told += "; times: position error of an open-loop prediction that long"
+    console.print(told, style="dim")
+    share = float(first.used.mean())
+    if share < 0.95:
+        console.print(
+            f"{percent(share)} of the samples count; in the others the collective command does not tell the thrust.",
+            style="dim",
+        )
+    for note in first.flight.notes:
+        console.print(f"note: {note}", style="dim")
+
+
+def print_where(console: Console, where: WhereItFails) -> None:
+    """The regions that hold the error, and the worst moments."""
+    console.print(Text("Where it fails", style="bold"))
+    if not where.regions:
+        console.print("  evenly: no region holds much more than its share of the error")
+    for region in where.regions:
+        console.print(f"  {region.text}")
+    if where.worst:
+        console.print(Text("Worst moments", style="bold"))
+    for moment in where.worst[:3]:
+        console.print(f"  {moment.start:6.1f} to {moment.end:.1f} s  {moment.rms:.2f} m/s²  {moment.text}")
+
+
+def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) -> None:
+    """The ranking of effects, and the residual before and after."""
+    shown = [e for e in d.effects if everything or e.verdict in ("missing", "possible")]
+    if shown:
+        table = Table(title=f"{d.flight.name}: which effect is missing", title_justify="left")
+        table.add_column("effect", no_wrap=True)
+        table.add_column("verdict", no_wrap=True)
+        table.add_column("share of\nerror", justify="right")
+        table.add_column("parameters, 95 % interval", no_wrap=True)
+        table.add_column("not told from")
+        for e in shown:
+            table.add_row(
+                e.name,
+                Text(SAID[e.verdict], style=VERDICT_STYLE[e.verdict]),
+                percent(e.variance_share) if e.rank else "",
+                _parameters(e),
+                ", ".join(e.indistinguishable_from),
+            )
+        console.print(table)
+    else:
+        console.print(
+            Text(f"{d.flight.name}: nothing is missing that this flight could show", style="bold green")
+        )
+    line = f"residual {d.rms_before:.3f} -> {d.rms_after:.3f} m/s² (noise floor {d.noise_floor:.3f})"
+    if d.validation_before is not None and d.validation_after is not None:
+        line += f"; held-out flight {d.validation_before:.3f} -> {d.validation_after:.3f} m/s²"
+    console.print(Text(line, style="bold"))
+    if d.rotational is not None:
+        r = d.rotational
+        console.print(
+            f"angular acceleration {r.before:.3f} -> {r.after:.3f} rad/s² (noise floor {r.noise_floor:.3f})",
+            highlight=False,
+        )
+    if d.unexplained.verdict:
+        console.print(
+            f"Unexplained: {percent(d.unexplained.variance_share)} of what is left can be predicted but fits no known "
+            f"effect: {'; '.join(d.unexplained.where)}. More: groundstation remainder FLIGHT",
+            style="yellow",
+        )
+    if absent := d.named("not_supported"):
+        console.print(f"[dim]Looked for and not there:[/dim] {', '.join(absent)}", highlight=False)
+    for e in d.effects:
+        if e.verdict == "missing":
+            console.print(f"[bold]{e.name}[/bold]: {e.advice}", highlight=False)
+    for e in d.effects:
+        if e.verdict in ("possible", "not_excited") and e.advice:
+            console.print(f"[dim]{SAID[e.verdict]}[/dim] {e.name}: {e.advice}", highlight=False)
+
+
+def _parameters(e: EffectVerdict) -> str:
+    return "\n".join(
+        f"{p.name} = {p.value:.3g} {_unit(p.unit)}  [{p.low:.3g}, {p.high:.3g}]" for p in e.parameters
+    )
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else unit
+
+
+def print_waterfall(
+    console: Console, steps: Sequence[WaterfallStep], fitted: str, held_out: str | None
+) -> None:
+    """The error falling over the model versions, with bars."""
+    table = Table(title="residual RMS in m/s² as effects are added", title_justify="left")
+    table.add_column("model", no_wrap=True)
+    table.add_column(f"fitted: {fitted}", justify="right")
+    if held_out:
+        table.add_column(f"held out: {held_out}", justify="right")
+    table.add_column("", no_wrap=True)
+    most = max(s.fitted for s in steps)
+    for s in steps:
+        cells = [s.label, f"{s.fitted:.3f}"]
+        if held_out:
+            cells.append("" if s.held_out is None else f"{s.held_out:.3f}")
+        table.add_row(*cells, Text("█" * max(1, round(24 * s.fitted / most)), style="red"))
+    cells = ["noise floor", f"{steps[-1].noise_floor:.3f}"] + ([""] if held_out else [])
+    table.add_row(*cells, Text("█" * round(24 * steps[-1].noise_floor / most), style="dim"), style="dim")
+    console.print(table)
+
+
+def print_side_by_side(console: Console, beside: SideBySide) -> None:
+    """Residual per axis and open-loop error, one row a flight or model, and what each fails at."""
+    first = beside.comparisons[0]
+    table = Table(
+        title="measured minus predicted acceleration, RMS in m/s², heading frame, "
+        f"below {first.bandwidth:g} Hz",
+        title_justify="left",
+    )
+    table.add_column("", overflow="fold")
+    axes = [a.axis for a in first.axes]
+    for name in (*axes, "all", "change", "noise\nfloor", "position\nafter 1 s"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, c, change in zip(beside.names, beside.comparisons, beside.change, strict=True):
+        by_axis = {a.axis: f"{a.rms:.3f}" for a in c.axes}
+        table.add_row(
+            escape(name),
+            *(by_axis.get(axis, "") for axis in axes),
+            f"{c.rms:.3f}",
+            "" if c is first else f"{100 * change:+.0f} %",
+            f"{c.noise_floor:.3f}",
+            f"{100 * sum(x * x for x in c.horizons[-1].position) ** 0.5:.1f} cm" if c.horizons else "",
+        )
+    console.print(table)
+    for name, where in zip(beside.names, beside.where, strict=True):
+        told = where.regions[0].text if where.regions else "evenly, no region holds much more than its share"
+        console.print(f"[bold]{escape(name)}[/bold]: {escape(told)}", highlight=False)

@@ -1,0 +1,1 @@
+"""Studies over many simulated flights: calibration of the verdicts, the paper reproduced."""

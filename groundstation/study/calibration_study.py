@@ -1,0 +1,417 @@
+"""Seeded flights of known truth for the calibration of the diagnosis: drawn, flown and diagnosed, one folder a study.
+
+The flights are drawn here (what is hidden, how noisy the sensors are, where and how long the vehicle flies), flown by
+`sim-bridge fly` as another program, and diagnosed as any flight. What is done stays in the folder, one file a step.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import random
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from groundstation.evaluate.calibration import Case, case_from_table
+from groundstation.operate.processes import run_json
+from models.contract import LQR, LQR_INTEGRAL
+from models.database import database
+from models.design import load_design
+from models.effects import catalogue
+from models.errors import InputError
+from models.outside import json_object, read_text
+from models.reference import trajectory
+from models.trajectory import Segment, Trajectory, transfer
+from models.vehicle import GRAVITY, Vehicle, load_vehicle
+from models.whole_file import write_whole
+from models.workers import interrupts_held, worker_pool
+
+SHARES = {0: 0.3, 1: 0.4, 2: 0.2, 3: 0.1}
+"""Share of the flights with so many effects hidden in them."""
+NOISE = (1.0, 2.0)
+"""Scales of the sensors' noise, half of the flights each."""
+LENGTHS = (0.5, 1.0, 1.0, 1.5)
+"""Lengths of the flights, of the length asked for, a quarter each."""
+KINDS = {"survey": 0.5, "task": 0.3, "gentle": 0.1, "descent": 0.1}
+"""Share of each kind of flight: the excitation survey, a mixture of trajectories as for training, slow flight near a
+hover, and fast descents."""
+CHARGE = (0.6, 0.97)
+"""The battery's state of charge at the start."""
+CONTROLLERS = (LQR, LQR_INTEGRAL)
+"""Half of the flights each, where the design has an integral."""
+TOP = 2.5
+"""m above ground: flights but descents stay below, for a ceiling may hang at 2.78 m."""
+BETWEEN = (1.5, 3.0)
+"""m/s and m/s² from the end of one trajectory to the start of the next."""
+SETPOINTS = 50.0
+"""Hz of the setpoints that are handed to the simulator; quintics join them."""
+AIR_DENSITY = 1.225
+"""kg/m³ at sea level."""
+EVENTS = ("payload", "estimator_delay")
+"""What the simulator can hide and no effect of the catalogue stands for."""
+
+
+@dataclass(frozen=True)
+class Sortie:
+    """One flight of a study, before it is flown: `number` from 1, `seed` of the simulator, `rotor_speeds` whether its
+    record has them."""
+
+    number: int
+    seed: int
+    hidden: tuple[str, ...]
+    kind: str
+    seconds: float
+    noise: float
+    charge: float
+    controller: str
+    rotor_speeds: bool
+
+    @property
+    def name(self) -> str:
+        """Stem of its files."""
+        return f"{self.number:04d}"
+
+
+@dataclass(frozen=True)
+class Study:
+    """A folder of flights: the files of vehicle and design, `seed` of all draws, `seconds` of a flight of usual length,
+    `names` of the effects that may be hidden, `strength` the factor on their sizes."""
+
+    folder: Path
+    vehicle: Path
+    design: Path
+    seed: int
+    seconds: float
+    names: tuple[str, ...]
+    strength: float = 1.0
+
+    def settings(self) -> dict[str, Any]:
+        """All that the flights depend on, but their number."""
+        return {
+            "seed": self.seed,
+            "seconds": self.seconds,
+            "effects": list(self.names),
+            "strength": self.strength,
+            "vehicle": self.vehicle.read_text(encoding="utf-8"),
+            "design": self.design.read_text(encoding="utf-8"),
+        }
+
+    def open(self) -> None:
+        """Begin the folder or go on with it; raises `InputError` where it holds another study or foreign files."""
+        index = self.folder / "study.json"
+        text = json.dumps(self.settings(), indent=1)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if index.exists() and any(self.folder.glob("*.flight.json")):
+                self._same(_read(index), index)
+            elif not index.exists() and any(self.folder.iterdir()):
+                raise InputError(f"{self.folder}: holds files that are no study's; choose another --output")
+            else:
+                _write(index, text)
+        except (OSError, ValueError) as error:
+            raise InputError(f"{index}: cannot be used ({error}); choose another --output") from None
+
+    def _same(self, before: dict[str, Any], index: Path) -> None:
+        for key, now in self.settings().items():
+            if before.get(key) != now:
+                was = (
+                    f"{key} {before.get(key)}, now {now}" if key in ("seed", "seconds") else f"another {key}"
+                )
+                raise InputError(
+                    f"{self.folder}: begun with {was} (see {index.name}); go on with the same, or choose another "
+                    "--output"
+                )
+
+
+def hideable() -> tuple[str, ...]:
+    """Names that the simulator can hide and the catalogue knows; asks `sim-bridge effects`."""
+    told = run_json(["sim-bridge", "effects", "--json"])["effects"]
+    known = catalogue()
+    return tuple(row["name"] for row in told if row["name"] in known and row["name"] not in EVENTS)
+
+
+def sorties(study: Study, count: int) -> tuple[Sortie, ...]:
+    """The first `count` flights of a study; more of them begin with the same.
+
+    Every effect is hidden equally often: they are dealt from shuffled packs. How many a flight has follows `SHARES`
+    within every ten.
+    """
+    generator = random.Random(f"trueflight calibrate {study.seed}")
+    integral = load_design(study.design, load_vehicle(study.vehicle)).integral is not None
+    names = study.names
+    pack: list[str] = []
+
+    def deal(number: int) -> tuple[str, ...]:
+        nonlocal pack
+        dealt: list[str] = []
+        while len(dealt) < number:
+            if not set(pack) - set(dealt):
+                pack += generator.sample(list(names), len(names))
+            dealt.append(pack.pop(next(i for i, name in enumerate(pack) if name not in dealt)))
+        return tuple(dealt)
+
+    tens: list[int] = []
+    found = []
+    for number in range(1, count + 1):
+        if not tens:
+            tens = [n for n, share in SHARES.items() for _ in range(round(10 * share))]
+            generator.shuffle(tens)
+        hidden = deal(min(tens.pop(), len(names)))
+        # in the simulator's order, for there a later effect may act on what an earlier one has made of the thrust
+        ordered = tuple(sorted(hidden, key=names.index))
+        found.append(_sortie(generator, number, ordered, study.seconds, integral))
+    return tuple(found)
+
+
+def _sortie(
+    generator: random.Random, number: int, hidden: tuple[str, ...], seconds: float, integral: bool
+) -> Sortie:
+    (kind,) = generator.choices(list(KINDS), list(KINDS.values()))
+    descends = generator.random() < 0.7
+    if "vortex_ring" in hidden and descends:
+        kind = "descent"  # no other flight can show it
+    if "ceiling_effect" in hidden and kind == "descent":
+        kind = "survey"  # it would begin above the ceiling
+    return Sortie(
+        number=number,
+        seed=generator.randrange(2**31),
+        hidden=hidden,
+        kind=kind,
+        seconds=seconds * generator.choice(LENGTHS),
+        noise=generator.choice(NOISE),
+        charge=round(generator.uniform(*CHARGE), 3),
+        controller=generator.choice(CONTROLLERS if integral else CONTROLLERS[:1]),
+        rotor_speeds=generator.random() < 0.5,
+    )
+
+
+# --- where a flight goes --------------------------------------------------------------------------------------------
+
+
+def path_of(sortie: Sortie, vehicle: Vehicle) -> Trajectory:
+    """The trajectory of a flight, at least as long as asked."""
+    generator = random.Random(f"trueflight calibrate path {sortie.seed}")
+    segments: list[Segment] = []
+    here = None
+    flown = 0.0
+    for leg in _legs(sortie, vehicle, generator):
+        if here is not None:
+            between = transfer(here, leg.start, *BETWEEN)
+            # the leg after it begins with a yaw of its own, a turn away at most: heading is the same
+            segments += between.segments
+            flown += between.duration
+        segments += leg.segments
+        flown += leg.duration
+        here = leg.end
+        if flown >= sortie.seconds:
+            break
+    return Trajectory(sortie.kind, tuple(segments))
+
+
+def _legs(sortie: Sortie, vehicle: Vehicle, generator: random.Random) -> Iterator[Trajectory]:
+    if sortie.kind == "task":
+        for one in database(sortie.seed, 1000.0 if sortie.seconds > 600 else 30.0):
+            if one.trajectory != "excitation" and one.path.bounds[1][2] <= TOP:
+                yield one.path
+    while True:
+        if sortie.kind == "descent":
+            yield _descent(vehicle, generator)
+        elif sortie.kind == "gentle":
+            yield _gentle(generator)
+        else:
+            yield _survey(sortie, generator)
+
+
+def _survey(sortie: Sortie, generator: random.Random) -> Trajectory:
+    low, speed = generator.uniform(0.15, 0.4), generator.uniform(2.5, 4.5)
+    height = generator.uniform(1.0, TOP - 1.2)
+    if "ceiling_effect" in sortie.hidden:
+        height = TOP - 1.2
+    return trajectory("excitation", low=low, speed=speed, height=height)
+
+
+def _gentle(generator: random.Random) -> Trajectory:
+    """Slow flight near a hover, which shows little: what a flight cannot show must not be named."""
+    height = generator.uniform(0.8, 1.8)
+    kind = generator.choice(("hover", "steps", "rotation", "translation"))
+    if kind == "hover":
+        return trajectory("hover", height=height, duration=generator.uniform(8.0, 15.0))
+    if kind == "steps":
+        seed = float(generator.randrange(10**6))
+        return trajectory("steps", size=0.3, height=height, time=4.0, count=3.0, seed=seed)
+    if kind == "rotation":
+        return trajectory("rotation", angle=generator.uniform(-3.0, 3.0), rate=0.8, height=height)
+    plane = generator.choice(("x", "y", "xy"))
+    return trajectory("translation", plane=plane, size=1.0, speed=generator.uniform(0.4, 0.8), height=height)
+
+
+def _descent(vehicle: Vehicle, generator: random.Random) -> Trajectory:
+    """Up and down again at up to 1.4 times the rotors' induced velocity, where the vortex ring is."""
+    area = max(len(vehicle.rotor_positions), 1) * math.pi * vehicle.rotor_radius**2
+    induced = math.sqrt(vehicle.mass * GRAVITY / (2.0 * AIR_DENSITY * area))
+    speed = generator.uniform(0.6, 1.4) * induced
+    acceleration = 4.0
+    # a minimum-jerk transfer that reaches both peaks
+    size = 1.64 * speed**2 / acceleration
+    plane = generator.choice(("z", "z", "xz", "yz"))
+    return trajectory(
+        "translation", plane=plane, size=float(np.clip(size, 1.0, 50.0)), speed=speed, height=1.5
+    )
+
+
+def setpoints(path: Trajectory) -> str:
+    """The CSV that `sim-bridge fly --trajectory` reads."""
+    t = np.arange(round(path.duration * SETPOINTS) + 1) / SETPOINTS
+    sampled = path.sample(t)
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["t", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw"])
+    rows = np.column_stack(
+        [t, sampled.position, sampled.velocity, sampled.acceleration, np.unwrap(sampled.yaw)]
+    )
+    writer.writerows([[f"{value:.6g}" for value in row] for row in rows])
+    return out.getvalue()
+
+
+# --- flying and diagnosing ------------------------------------------------------------------------------------------
+
+
+def command_of(study: Study, sortie: Sortie) -> list[str]:
+    """The words that fly a sortie."""
+    stem = study.folder / sortie.name
+    words: list[object] = ["sim-bridge", "fly", "--trajectory", f"{stem}.setpoints.csv"]
+    words += ["--vehicle", study.vehicle, "--design", study.design]
+    for name in sortie.hidden or ("none",):
+        words += ["--hidden", name]
+    words += [
+        "--strength",
+        study.strength,
+        "--seed",
+        sortie.seed,
+        "--noise",
+        sortie.noise,
+        "--charge",
+        sortie.charge,
+    ]
+    words += ["--controller", sortie.controller]
+    words += ["--rotor-speeds" if sortie.rotor_speeds else "--no-rotor-speeds"]
+    words += ["-o", f"{stem}.mcap", "--sealed", f"{stem}.sealed", "--json"]
+    return [str(word) for word in words]
+
+
+def fly(study: Study, sortie: Sortie) -> dict[str, Any]:
+    """Fly a sortie, or tell of it where it has been flown: how it went, and what was hidden."""
+    stem = study.folder / sortie.name
+    kept = stem.with_suffix(".flight.json")
+    if kept.exists():
+        told = _read(kept)
+        if told.get("sortie") != json.loads(json.dumps(asdict(sortie))):
+            raise InputError(f"{kept}: was flown for another study; choose another --output")
+        return told
+    vehicle = load_vehicle(study.vehicle)
+    # of a run that was killed before it could tell
+    stem.with_suffix(".mcap").unlink(missing_ok=True)
+    _write(stem.with_suffix(".setpoints.csv"), setpoints(path_of(sortie, vehicle)))
+    report = run_json(command_of(study, sortie))
+    truth = run_json(["sim-bridge", "reveal", stem.with_suffix(".sealed"), "--json"])
+    told = {
+        "sortie": asdict(sortie),
+        "outcome": report["outcome"],
+        "seconds": report["simulated"],
+        "ticks_on_ground": report["ticks_on_ground"],
+        "hidden": truth["effects"],
+        "vehicle": vehicle.name,
+        "command_delay": vehicle.command_delay,
+    }
+    _write(kept, json.dumps(told, indent=1))
+    return told
+
+
+def diagnose_record(study: Study, sortie: Sortie) -> dict[str, Any]:
+    """Diagnose a record as any flight, or tell what was found before; its failure is told under "error"."""
+    from groundstation.identify.translation import diagnose
+    from groundstation.output.as_json import diagnosis_table
+    from groundstation.reading import read_flight
+    from models.model import rigid_body_model
+
+    kept = (study.folder / sortie.name).with_suffix(".diagnosis.json")
+    if kept.exists():
+        told = _read(kept)
+        return told
+    begin = time.perf_counter()
+    try:
+        flight = read_flight((study.folder / sortie.name).with_suffix(".mcap"))
+        told = diagnosis_table(diagnose(flight, rigid_body_model(flight.vehicle)))
+    except Exception as error:  # noqa: BLE001 - one flight that ends in an error is a finding, not the end
+        told = {"error": f"{type(error).__name__}: {error}"}
+    told["diagnosis_seconds"] = time.perf_counter() - begin
+    _write(kept, json.dumps(told, indent=1))
+    return told
+
+
+def _work(study: Study, sortie: Sortie) -> Case:
+    flown = fly(study, sortie)
+    finished = flown["outcome"] == "finished"
+    return case_from_table(flown, diagnose_record(study, sortie) if finished else None)
+
+
+def run(study: Study, wanted: Sequence[Sortie], jobs: int, done: Callable[[Case], None]) -> tuple[Case, ...]:
+    """Fly and diagnose what the folder lacks; `done` hears of each flight. In the order of `wanted`.
+
+    With `jobs` 1 here, otherwise in so many processes. When interrupted, flights under way are finished and kept, and
+    the rest is not begun.
+    """
+    cases: dict[int, Case] = {}
+    try:
+        for case in _each(study, wanted, min(jobs, len(wanted))):
+            cases[case.number] = case
+            done(case)
+    except BrokenProcessPool:
+        raise InputError(
+            f"{study.folder}: a process was ended from outside (out of memory?); the same command goes on, with fewer "
+            "--jobs if need be"
+        ) from None
+    except KeyboardInterrupt:
+        raise InputError(
+            f"interrupted: {len(cases)} of {len(wanted)} flights are done in {study.folder}; the same command goes on"
+        ) from None
+    return tuple(cases[sortie.number] for sortie in wanted)
+
+
+def _each(study: Study, wanted: Sequence[Sortie], jobs: int) -> Iterator[Case]:
+    if jobs == 1:
+        yield from (_work(study, sortie) for sortie in wanted)
+        return
+    # each worker uses one core; the variables are read when the workers' numpy is loaded
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    with worker_pool(jobs) as pool:
+        with interrupts_held():
+            begun = [pool.submit(_work, study, s) for s in wanted]
+        yield from (one.result() for one in as_completed(begun))
+
+
+def forget_diagnoses(study: Study) -> None:
+    """Let every flight be diagnosed anew; the flights stay."""
+    for path in study.folder.glob("*.diagnosis.json"):
+        path.unlink()
+
+
+def _read(path: Path) -> dict[str, Any]:
+    advice = "remove it, and the same command goes on"
+    return json_object(read_text(path, "the study", advice), str(path), advice)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    write_whole(path, text, "the study", "choose another --output")

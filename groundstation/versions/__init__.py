@@ -1,0 +1,1 @@
+"""What is kept: model versions, a drafted vehicle, files of new effects."""
