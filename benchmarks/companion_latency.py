@@ -38,13 +38,13 @@ def autopilot(mavlink: int, port: int, flying: bool, seconds: float) -> None:
     """The simulated autopilot with a stopwatch; prints its findings as JSON and ends."""
     from pymavlink.dialects.v20 import common as mav
 
-    from models.vehicle import load_vehicle
-    from sim_bridge.autopilot import Autopilot
-    from sim_bridge.mavlink.server import Link, Server
-    from sim_bridge.modes import Mode
-    from sim_bridge.parameters import Parameters
-    from sim_bridge.simulator import Simulator
-    from sim_bridge.truth.hidden import choose
+    from trueflight.models.vehicle import load_vehicle
+    from trueflight.sim_bridge.autopilot import Autopilot
+    from trueflight.sim_bridge.mavlink.server import Link, Server
+    from trueflight.sim_bridge.modes import Mode
+    from trueflight.sim_bridge.parameters import Parameters
+    from trueflight.sim_bridge.simulator import Simulator
+    from trueflight.sim_bridge.truth.hidden import choose
 
     vehicle = load_vehicle(VEHICLE)
     pilot = Autopilot(Simulator(vehicle, choose(["none"], vehicle, 0), 0), Parameters(vehicle))
@@ -162,7 +162,7 @@ def measure(kind: str, rate: float, seconds: float) -> dict[str, Any]:
         if flying:
             zenoh_port = free_port(socket.SOCK_STREAM)
             subject = spawn(
-                *("-c", "from companion.cli import main; main()", "run", "--vehicle", VEHICLE),
+                *("-c", "from trueflight.companion.cli import main; main()", "run", "--vehicle", VEHICLE),
                 *(
                     "--connect",
                     f"udpin://127.0.0.1:{mavlink}",
@@ -206,7 +206,7 @@ def listen(port: int, seconds: float) -> None:
     """The ground: asks for a long hover and listens to every tick."""
     import zenoh
 
-    from models import contract
+    from trueflight.models import contract
 
     config = zenoh.Config()
     config.insert_json5("connect/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))

@@ -26,8 +26,8 @@ import numpy as np
 from onnx_models import constant_model, deep_model, drag_model, linear_model, nan_model
 from rig import Bridge, Companion, free_port, wait_for
 
-from models import contract
-from models.record_pb2 import Tick
+from trueflight.models import contract
+from trueflight.models.record_pb2 import Tick
 
 FLIGHT = {"trajectory": "lemniscate", "parameters": {"laps": 30.0, "speed": 2.0}}
 GOOD = drag_model(0.05)

@@ -32,20 +32,20 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from groundstation.identify.fitting import BLOCK, Problem
-from groundstation.identify.translation import diagnose
-from groundstation.measured.measurement import measure
-from groundstation.reading import read_flight
-from models.design import load_design
-from models.effect import Effect, Stage
-from models.effects import catalogue, effect_named
-from models.flight import Flight
-from models.model import rigid_body_model
-from models.reference import trajectory
-from models.vehicle import load_vehicle
-from sim_bridge.in_process import Plan, record
-from sim_bridge.truth.hidden import choose
-from sim_bridge.truth.sensors import Noise
+from trueflight.groundstation.identify.fitting import BLOCK, Problem
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.measured.measurement import measure
+from trueflight.groundstation.reading import read_flight
+from trueflight.models.design import load_design
+from trueflight.models.effect import Effect, Stage
+from trueflight.models.effects import catalogue, effect_named
+from trueflight.models.flight import Flight
+from trueflight.models.model import rigid_body_model
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import load_vehicle
+from trueflight.sim_bridge.in_process import Plan, record
+from trueflight.sim_bridge.truth.hidden import choose
+from trueflight.sim_bridge.truth.sensors import Noise
 
 VEHICLE = Path(__file__).parents[1] / "models/vehicles/quad5/vehicle.toml"
 HIDDEN = (

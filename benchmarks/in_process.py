@@ -20,13 +20,13 @@ from pathlib import Path
 
 import mujoco
 
-from models.design import load_design
-from models.reference import trajectory
-from models.vehicle import load_vehicle
-from sim_bridge.in_process import Plan, fly, record
-from sim_bridge.simulator import Simulator
-from sim_bridge.truth.hidden import EFFECTS, choose
-from sim_bridge.world import PHYSICS_STEP, World
+from trueflight.models.design import load_design
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import load_vehicle
+from trueflight.sim_bridge.in_process import Plan, fly, record
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.truth.hidden import EFFECTS, choose
+from trueflight.sim_bridge.world import PHYSICS_STEP, World
 
 QUAD5 = Path(__file__).parents[1] / "models/vehicles/quad5/vehicle.toml"
 

@@ -12,10 +12,10 @@ import argparse
 import time
 from pathlib import Path
 
-from groundstation.commands.train import read_flights
-from groundstation.learn.training import recipe_named, train, with_epochs
-from groundstation.learn.training_data import samples_of_flights
-from models.model import rigid_body_model
+from trueflight.groundstation.commands.train import read_flights
+from trueflight.groundstation.learn.training import recipe_named, train, with_epochs
+from trueflight.groundstation.learn.training_data import samples_of_flights
+from trueflight.models.model import rigid_body_model
 
 
 def main() -> None:

@@ -8,12 +8,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from companion.findings import DANGER, FAIL, NOTE, OK, WARN, Finding
-from companion.settings import Settings
-from companion.zenoh_session import INSECURE, plan_session
-from models.access import CERTIFICATE, Keys, certificate_period
-from models.errors import InputError
-from models.vehicle import load_vehicle
+from trueflight.companion.findings import DANGER, FAIL, NOTE, OK, WARN, Finding
+from trueflight.companion.settings import Settings
+from trueflight.companion.zenoh_session import INSECURE, plan_session
+from trueflight.models.access import CERTIFICATE, Keys, certificate_period
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import load_vehicle
 
 
 def access_findings(settings: Settings) -> Iterator[Finding]:

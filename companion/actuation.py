@@ -12,7 +12,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from models.contract import ACTUATION_LIMITS
+from trueflight.models.contract import ACTUATION_LIMITS
 
 Pair = tuple[float, float]
 

@@ -14,8 +14,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from companion.vehicle_link import ImuSample, Odometry
-from models.vehicle import GRAVITY
+from trueflight.companion.vehicle_link import ImuSample, Odometry
+from trueflight.models.vehicle import GRAVITY
 
 Vector = tuple[float, float, float]
 

@@ -9,23 +9,23 @@ import time
 from pathlib import Path
 from typing import Any
 
-from companion.control import ControlLaw
-from companion.director import Director
-from companion.flight import IDLE, Flight
-from companion.mission_request import SMALL, read_json, read_request
-from companion.pose import PoseFeed
-from companion.settings import Settings
-from companion.signature import Signatures
-from companion.store import ModelStore
-from companion.telemetry import ATTACHED, Telemetry, make_event
-from companion.tick import make_tick
-from companion.vehicle_link import Odometry, VehicleLink
-from companion.watchdog import Watchdog, raise_priority
-from companion.zenoh_session import INSECURE, open_planned, plan_session
-from models.contract import model_hash
-from models.design import load_design
-from models.errors import InputError, shown
-from models.vehicle import load_vehicle
+from trueflight.companion.control import ControlLaw
+from trueflight.companion.director import Director
+from trueflight.companion.flight import IDLE, Flight
+from trueflight.companion.mission_request import SMALL, read_json, read_request
+from trueflight.companion.pose import PoseFeed
+from trueflight.companion.settings import Settings
+from trueflight.companion.signature import Signatures
+from trueflight.companion.store import ModelStore
+from trueflight.companion.telemetry import ATTACHED, Telemetry, make_event
+from trueflight.companion.tick import make_tick
+from trueflight.companion.vehicle_link import Odometry, VehicleLink
+from trueflight.companion.watchdog import Watchdog, raise_priority
+from trueflight.companion.zenoh_session import INSECURE, open_planned, plan_session
+from trueflight.models.contract import model_hash
+from trueflight.models.design import load_design
+from trueflight.models.errors import InputError, shown
+from trueflight.models.vehicle import load_vehicle
 
 _M_ARENA_MAX = -8  # malloc.h
 _RATE_TRIES = 10

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
-from models.design import Design
-from models.trajectory import ReferenceSample
-from models.vehicle import GRAVITY
+from trueflight.models.design import Design
+from trueflight.models.trajectory import ReferenceSample
+from trueflight.models.vehicle import GRAVITY
 
 Vector = tuple[float, float, float]
 _States = tuple[float, ...]

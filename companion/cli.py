@@ -14,8 +14,8 @@ from typing import Annotated, Any
 
 import typer
 
-from companion import onboard_commands
-from models.errors import run_command_line
+from trueflight.companion import onboard_commands
+from trueflight.models.errors import run_command_line
 
 app = typer.Typer(
     name="companion",
@@ -83,9 +83,9 @@ def run(
     land, falls silent once that has taken over, closes the record and exits; a second signal ends it at once,
     and then the autopilot's offboard-loss failsafe is what lands the vehicle.
     """
-    from companion.app import Companion
-    from companion.settings import load_settings
-    from companion.zenoh_session import INSECURE
+    from trueflight.companion.app import Companion
+    from trueflight.companion.settings import load_settings
+    from trueflight.companion.zenoh_session import INSECURE
 
     settings = load_settings(config)
     given: dict[str, Any] = {
@@ -159,8 +159,8 @@ def check(
     from rich.markup import escape
     from rich.table import Table
 
-    from companion.settings import Settings
-    from companion.vehicle_link import VehicleLink
+    from trueflight.companion.settings import Settings
+    from trueflight.companion.vehicle_link import VehicleLink
 
     defaults = Settings()
     link = VehicleLink(
@@ -207,7 +207,7 @@ def trajectories(as_json: Json = False) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from models.reference import KINDS
+    from trueflight.models.reference import KINDS
 
     if as_json:
         listing = {

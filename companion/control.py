@@ -16,9 +16,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from models.design import Design, Matrix
-from models.trajectory import ReferenceSample
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.models.design import Design, Matrix
+from trueflight.models.trajectory import ReferenceSample
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)

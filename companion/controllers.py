@@ -20,9 +20,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from companion.actuation import Actuation, LagInverse, RateModel
-from companion.behaviour import LinearBehaviour
-from companion.control import (
+from trueflight.companion.actuation import Actuation, LagInverse, RateModel
+from trueflight.companion.behaviour import LinearBehaviour
+from trueflight.companion.control import (
     ZERO,
     Attitude,
     ControlLaw,
@@ -33,11 +33,11 @@ from companion.control import (
     features,
     world_from_body,
 )
-from companion.guard import Correction
-from models.contract import CONTROLLERS, CORRECTED, LQR, LQR_INTEGRAL
-from models.errors import InputError
-from models.trajectory import ReferenceSample
-from models.vehicle import GRAVITY
+from trueflight.companion.guard import Correction
+from trueflight.models.contract import CONTROLLERS, CORRECTED, LQR, LQR_INTEGRAL
+from trueflight.models.errors import InputError
+from trueflight.models.trajectory import ReferenceSample
+from trueflight.models.vehicle import GRAVITY
 
 Preview = Callable[[float], ReferenceSample]
 """The reference so many seconds from now; it holds still after its end."""

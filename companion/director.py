@@ -16,21 +16,31 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from companion.flight import IDLE, LANDING, MISSION, SILENT, TAKEOFF, Decision, Flight, Mission, Safety
-from companion.guard import Guard
-from companion.message_rates import link_too_slow, odometry_too_low
-from companion.mission_request import mission_request
-from companion.pose import PoseFeed
-from companion.records import Records
-from companion.shadow import Shadow, ShadowLimits
-from companion.store import ModelStore
-from companion.vehicle_link import Rates, VehicleLink
-from companion.watch import GuardLimits
-from models.contract import CORRECTED
-from models.design import Design
-from models.errors import InputError, shown
-from models.reference import Trajectory
-from models.vehicle import Vehicle
+from trueflight.companion.flight import (
+    IDLE,
+    LANDING,
+    MISSION,
+    SILENT,
+    TAKEOFF,
+    Decision,
+    Flight,
+    Mission,
+    Safety,
+)
+from trueflight.companion.guard import Guard
+from trueflight.companion.message_rates import link_too_slow, odometry_too_low
+from trueflight.companion.mission_request import mission_request
+from trueflight.companion.pose import PoseFeed
+from trueflight.companion.records import Records
+from trueflight.companion.shadow import Shadow, ShadowLimits
+from trueflight.companion.store import ModelStore
+from trueflight.companion.vehicle_link import Rates, VehicleLink
+from trueflight.companion.watch import GuardLimits
+from trueflight.models.contract import CORRECTED
+from trueflight.models.design import Design
+from trueflight.models.errors import InputError, shown
+from trueflight.models.reference import Trajectory
+from trueflight.models.vehicle import Vehicle
 
 QUEUE_LIMIT = 16
 _STREAM_BEFORE_OFFBOARD = 0.6  # s; PX4 wants to have heard setpoints for half a second

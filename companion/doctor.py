@@ -21,17 +21,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from companion.access import access_findings
-from companion.findings import FAIL, NOTE, OK, WARN, Finding
-from companion.inspection import inspect
-from companion.message_rates import link_too_slow, odometry_too_low
-from companion.settings import Settings
-from companion.store import live_file
-from companion.vehicle_link import VehicleLink
-from companion.zenoh_session import plan_session
-from models.design import load_design
-from models.errors import InputError
-from models.vehicle import Vehicle, load_vehicle
+from trueflight.companion.access import access_findings
+from trueflight.companion.findings import FAIL, NOTE, OK, WARN, Finding
+from trueflight.companion.inspection import inspect
+from trueflight.companion.message_rates import link_too_slow, odometry_too_low
+from trueflight.companion.settings import Settings
+from trueflight.companion.store import live_file
+from trueflight.companion.vehicle_link import VehicleLink
+from trueflight.companion.zenoh_session import plan_session
+from trueflight.models.design import load_design
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle, load_vehicle
 
 _PACKAGES = ("mavsdk", "eclipse-zenoh", "onnxruntime", "mcap", "protobuf", "numpy")
 _BAUD = 921_600

@@ -17,18 +17,18 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from companion.agreement import Agreement, AgreementLimits
-from companion.control import IDLE_STEP, Attitude, ControlLaw, ControlStep, State, euler, features
-from companion.controllers import Controller, TrimLimits, make_controller
-from companion.guard import Guard
-from companion.resets import Reset, found_reset
-from companion.shadow import Shadow, error_acceleration
-from companion.vehicle_link import Latest, Odometry
-from companion.watch import Watch
-from models.contract import CONTROLLERS, CORRECTED
-from models.errors import InputError
-from models.reference import Trajectory, transfer
-from models.trajectory import ReferenceSample, Waypoint, path
+from trueflight.companion.agreement import Agreement, AgreementLimits
+from trueflight.companion.control import IDLE_STEP, Attitude, ControlLaw, ControlStep, State, euler, features
+from trueflight.companion.controllers import Controller, TrimLimits, make_controller
+from trueflight.companion.guard import Guard
+from trueflight.companion.resets import Reset, found_reset
+from trueflight.companion.shadow import Shadow, error_acceleration
+from trueflight.companion.vehicle_link import Latest, Odometry
+from trueflight.companion.watch import Watch
+from trueflight.models.contract import CONTROLLERS, CORRECTED
+from trueflight.models.errors import InputError
+from trueflight.models.reference import Trajectory, transfer
+from trueflight.models.trajectory import ReferenceSample, Waypoint, path
 
 Vector = tuple[float, float, float]
 

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from companion.actuation import ACTS_AT_ONCE, Actuation
-from companion.onnx_structure import why_not_self_contained
-from companion.watch import GuardLimits, Range, Watch
-from models import contract
-from models.errors import InputError, shown
-from models.vehicle import Vehicle
+from trueflight.companion.actuation import ACTS_AT_ONCE, Actuation
+from trueflight.companion.onnx_structure import why_not_self_contained
+from trueflight.companion.watch import GuardLimits, Range, Watch
+from trueflight.models import contract
+from trueflight.models.errors import InputError, shown
+from trueflight.models.vehicle import Vehicle
 
 MAX_BYTES = 4 << 20
 """The networks meant here have tens of kilobytes; anything near this is not one of them."""

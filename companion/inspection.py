@@ -16,14 +16,14 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING, Any
 
-from companion.child import ask_child, begin_child
-from companion.confined import confine, leave_network
-from models.vehicle import Vehicle
+from trueflight.companion.child import ask_child, begin_child
+from trueflight.companion.confined import confine, leave_network
+from trueflight.models.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from companion.inference import ModelInfo, Verdict
+    from trueflight.companion.inference import ModelInfo, Verdict
 
-CHILD = (sys.executable, "-m", "companion.inspection")
+CHILD = (sys.executable, "-m", "trueflight.companion.inspection")
 PATIENCE = 30.0
 """Seconds of the wall's clock for one file; on a busy machine the child gets what others leave."""
 PROCESSOR_TIME = 10
@@ -84,8 +84,8 @@ def _ask_child(files: Sequence[bytes], vehicle: Vehicle, deadline: float) -> tup
 
 
 def _finding(answer: dict[str, Any]) -> Finding:
-    from companion.actuation import Actuation
-    from companion.inference import ModelInfo, Range
+    from trueflight.companion.actuation import Actuation
+    from trueflight.companion.inference import ModelInfo, Range
 
     info = answer["info"]
     if info is not None:
@@ -113,7 +113,7 @@ def _main() -> None:
     network = leave_network()
     descriptor, whole = begin_child()
     answers = os.fdopen(descriptor, "w")
-    from companion.inference import check_model, warm_up
+    from trueflight.companion.inference import check_model, warm_up
 
     warm_up()
     line, _, rest = whole.partition(b"\n")

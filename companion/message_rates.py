@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from companion.vehicle_link import Rates
+from trueflight.companion.vehicle_link import Rates
 
 _ONBOARD_RATE = (
     80_000  # bytes/s: odometry and accelerometer for 100 Hz of control beside an onboard link's other streams

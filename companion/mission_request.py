@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from companion.child import ask_child, begin_child
-from companion.confined import confine, leave_network
-from models.errors import InputError, shown
-from models.reference import KINDS, Trajectory, check_duration, trajectory, trajectory_from_csv
-from models.trajectory import SetpointTable
+from trueflight.companion.child import ask_child, begin_child
+from trueflight.companion.confined import confine, leave_network
+from trueflight.models.errors import InputError, shown
+from trueflight.models.reference import KINDS, Trajectory, check_duration, trajectory, trajectory_from_csv
+from trueflight.models.trajectory import SetpointTable
 
 SMALL = 8 << 10
 """Bytes of a message that are parsed in less than a tenth of a control tick."""
-CHILD = (sys.executable, "-m", "companion.mission_request")
+CHILD = (sys.executable, "-m", "trueflight.companion.mission_request")
 PATIENCE, PROCESSOR_TIME, MEMORY = 20.0, 10, 192 << 20
 _KEYS = ("trajectory", "parameters", "setpoints", "controller", "repeat")
 

@@ -14,13 +14,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn
 
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
-    from companion.pose import PoseFeed
-    from companion.settings import Settings
-    from companion.vehicle_link import VehicleLink
-    from models.vehicle import Vehicle
+    from trueflight.companion.pose import PoseFeed
+    from trueflight.companion.settings import Settings
+    from trueflight.companion.vehicle_link import VehicleLink
+    from trueflight.models.vehicle import Vehicle
 
 console = Console()
 _FAILED = 2
@@ -71,10 +71,10 @@ def preflight_command(
     Nothing is changed without `--set-params`. While it runs it shows itself as a ground station, so that older
     PX4 tells its reasons; run it on the ground, disarmed. Exit code 2 where a flight would be refused or end badly.
     """
-    from companion import preflight
-    from companion.findings import table_of
-    from companion.vehicle_link import VehicleLink
-    from models.vehicle import load_vehicle
+    from trueflight.companion import preflight
+    from trueflight.companion.findings import table_of
+    from trueflight.companion.vehicle_link import VehicleLink
+    from trueflight.models.vehicle import load_vehicle
 
     settings = _settings(config, vehicle, connect, rate, timeout, records)
     settings.check_address()
@@ -125,8 +125,8 @@ def doctor_command(
     Says what to do about what it finds and changes nothing. Exit code 2 where something would keep a vehicle
     from flying.
     """
-    from companion import doctor
-    from companion.findings import FAIL, rows_of, table_of
+    from trueflight.companion import doctor
+    from trueflight.companion.findings import FAIL, rows_of, table_of
 
     settings = _settings(config, vehicle, connect, rate, timeout, None)
     with _progress(as_json) as tell:
@@ -175,7 +175,7 @@ def install_command(
     The unit restarts the companion, watches its control tick, runs it as a user of its own and lets the control
     thread ask for a real-time priority. A file that you have changed is kept, and the new one put beside it.
     """
-    from companion.service import Service, install, next_steps, texts
+    from trueflight.companion.service import Service, install, next_steps, texts
 
     beside = design if design is not None else vehicle.with_name("design.json")
     service = Service(vehicle, beside, connect, user, listen or "", realtime, keys=keys, insecure=insecure)
@@ -204,7 +204,7 @@ def _settings(
     timeout: float | None,
     records: Path | None,
 ) -> Settings:
-    from companion.settings import load_settings
+    from trueflight.companion.settings import load_settings
 
     settings = load_settings(config)
     given: dict[str, Any] = {"vehicle": vehicle, "connect": connect, "records": records}
@@ -226,9 +226,9 @@ def _poses(settings: Settings, vehicle: Vehicle | None, link: VehicleLink) -> It
         return
     if vehicle is None:
         raise InputError("[pose] is enabled: pass --vehicle, whose name is in the key of the poses")
-    from companion.pose import PoseFeed
-    from companion.zenoh_session import open_session
-    from models.contract import key
+    from trueflight.companion.pose import PoseFeed
+    from trueflight.companion.zenoh_session import open_session
+    from trueflight.models.contract import key
 
     session = open_session(settings.zenoh, settings.own_keys(), vehicle.name)
     feed = PoseFeed(settings.pose, link.send_pose, lambda level, kind, text: None)

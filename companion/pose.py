@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from models.errors import InputError
-from models.pose import Pose, pose_from_json
+from trueflight.models.errors import InputError
+from trueflight.models.pose import Pose, pose_from_json
 
 CLOCKS = SENDER, ARRIVAL = ("sender", "arrival")
 _WAITING = 8

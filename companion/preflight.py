@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from companion.access import access_findings
-from companion.findings import FAIL, NOTE, OK, WARN, Finding, rows_of
-from companion.message_rates import link_too_slow, odometry_too_low
-from companion.pose import PoseFeed
-from companion.px4_events import ERROR
-from companion.settings import Settings
-from companion.vehicle_link import Rates, VehicleLink
-from models.errors import InputError
-from models.record import read_record
-from models.vehicle import Vehicle
+from trueflight.companion.access import access_findings
+from trueflight.companion.findings import FAIL, NOTE, OK, WARN, Finding, rows_of
+from trueflight.companion.message_rates import link_too_slow, odometry_too_low
+from trueflight.companion.pose import PoseFeed
+from trueflight.companion.px4_events import ERROR
+from trueflight.companion.settings import Settings
+from trueflight.companion.vehicle_link import Rates, VehicleLink
+from trueflight.models.errors import InputError
+from trueflight.models.record import read_record
+from trueflight.models.vehicle import Vehicle
 
 Number = int | float
 

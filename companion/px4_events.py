@@ -12,7 +12,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from companion.px4_checks import CHECKS, NO_SETPOINTS, TOLD_ANYWAY
+from trueflight.companion.px4_checks import CHECKS, NO_SETPOINTS, TOLD_ANYWAY
 
 ERROR, WARNING = 3, 4
 """Log levels as in syslog: lower is worse."""

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from companion.flight import Mission
-from models.design import Design
-from models.errors import InputError
-from models.record import FlightRecorder
-from models.record_pb2 import Event
-from models.vehicle import Vehicle
+from trueflight.companion.flight import Mission
+from trueflight.models.design import Design
+from trueflight.models.errors import InputError
+from trueflight.models.record import FlightRecorder
+from trueflight.models.record_pb2 import Event
+from trueflight.models.vehicle import Vehicle
 
 _BYTES_A_TICK = 500
 """More than a tick takes on the disk: 291 bytes in a corrected lemniscate over the stand-in."""

@@ -15,10 +15,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.zenoh_session import LOCAL, WITH_KEYS, ZenohSettings, plan_session
-from models.access import ACCESS, AUTHORITY, CERTIFICATE, PRIVATE_KEY, read_keys
-from models.errors import InputError
-from models.vehicle import load_vehicle
+from trueflight.companion.zenoh_session import LOCAL, WITH_KEYS, ZenohSettings, plan_session
+from trueflight.models.access import ACCESS, AUTHORITY, CERTIFICATE, PRIVATE_KEY, read_keys
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import load_vehicle
 
 UNIT = "etc/systemd/system/trueflight-companion.service"
 SYSUSERS = "etc/sysusers.d/trueflight.conf"
@@ -82,7 +82,9 @@ class Service:
     def command(self) -> str:
         """The program that the unit starts."""
         beside = Path(sys.executable).with_name("companion")
-        return self.program or (str(beside) if beside.is_file() else f"{sys.executable} -m companion.cli")
+        return self.program or (
+            str(beside) if beside.is_file() else f"{sys.executable} -m trueflight.companion.cli"
+        )
 
 
 def texts(service: Service) -> dict[str, str]:

@@ -8,18 +8,18 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from companion.agreement import AgreementLimits
-from companion.control import Limits
-from companion.controllers import TrimLimits
-from companion.flight import Safety
-from companion.pose import PoseSettings
-from companion.shadow import ShadowLimits
-from companion.signature import LOCAL, UNSIGNED
-from companion.watch import GuardLimits
-from companion.zenoh_session import ZenohSettings
-from models.access import Keys, read_keys
-from models.errors import InputError
-from models.outside import is_number, read_toml, shown
+from trueflight.companion.agreement import AgreementLimits
+from trueflight.companion.control import Limits
+from trueflight.companion.controllers import TrimLimits
+from trueflight.companion.flight import Safety
+from trueflight.companion.pose import PoseSettings
+from trueflight.companion.shadow import ShadowLimits
+from trueflight.companion.signature import LOCAL, UNSIGNED
+from trueflight.companion.watch import GuardLimits
+from trueflight.companion.zenoh_session import ZenohSettings
+from trueflight.models.access import Keys, read_keys
+from trueflight.models.errors import InputError
+from trueflight.models.outside import is_number, read_toml, shown
 
 T = TypeVar("T")
 

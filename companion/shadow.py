@@ -13,9 +13,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from companion.control import euler, world_from_body
-from companion.watch import ZERO, Vector, Watch
-from models.vehicle import GRAVITY
+from trueflight.companion.control import euler, world_from_body
+from trueflight.companion.watch import ZERO, Vector, Watch
+from trueflight.models.vehicle import GRAVITY
 
 
 @dataclass(frozen=True)

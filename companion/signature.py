@@ -12,10 +12,10 @@ import threading
 from datetime import UTC, datetime
 from pathlib import Path
 
-from models.access import ENGINEER, Keys
-from models.contract import model_hash
-from models.errors import InputError
-from models.signature import read_signature, verify
+from trueflight.models.access import ENGINEER, Keys
+from trueflight.models.contract import model_hash
+from trueflight.models.errors import InputError
+from trueflight.models.signature import read_signature, verify
 
 UNSIGNED = LOCAL, ALLOWED, REFUSED = ("local", "allowed", "refused")
 """What `unsigned_models` may be: accepted while no other machine can send one, accepted, refused."""

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.inference import MAX_BYTES, Model, ModelInfo, open_model
-from companion.inspection import Finding, inspect
-from models.contract import model_hash
-from models.errors import InputError
-from models.vehicle import Vehicle
+from trueflight.companion.inference import MAX_BYTES, Model, ModelInfo, open_model
+from trueflight.companion.inspection import Finding, inspect
+from trueflight.models.contract import model_hash
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle
 
 KEPT = 8
 """Models of the past that stay on board; each is checked again when the companion starts."""

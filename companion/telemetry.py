@@ -38,10 +38,10 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from companion.mission_request import SMALL, read_json
-from models import contract
-from models.errors import InputError, shown
-from models.record_pb2 import Event
+from trueflight.companion.mission_request import SMALL, read_json
+from trueflight.models import contract
+from trueflight.models.errors import InputError, shown
+from trueflight.models.record_pb2 import Event
 
 TICKS_KEPT, EVENTS_KEPT = 1000, 200
 REQUESTS_WAITING = 64

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from companion.flight import Outcome
-from companion.vehicle_link import Latest, Odometry
-from models.record_pb2 import Tick
+from trueflight.companion.flight import Outcome
+from trueflight.companion.vehicle_link import Latest, Odometry
+from trueflight.models.record_pb2 import Tick
 
 
 def make_tick(odometry: Odometry, latest: Latest, outcome: Outcome, latency: float) -> Tick:

@@ -37,12 +37,12 @@ from mavsdk.plugins.mocap.mocap import (
 from mavsdk.plugins.param.param import Param, ParamError, ParamResult
 from mavsdk.system import System
 
-from companion.arrival import Arrivals
-from companion.estimator import EstimatorStatus, estimator_status
-from companion.px4_events import ArmingChecks, ArmingReport, Px4Event, describe, unhealthy
-from models import frames
-from models.errors import InputError
-from models.pose import Pose
+from trueflight.companion.arrival import Arrivals
+from trueflight.companion.estimator import EstimatorStatus, estimator_status
+from trueflight.companion.px4_events import ArmingChecks, ArmingReport, Px4Event, describe, unhealthy
+from trueflight.models import frames
+from trueflight.models.errors import InputError
+from trueflight.models.pose import Pose
 
 Vector = tuple[float, float, float]
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import zenoh
 
-from models import access
-from models.access import Keys
-from models.errors import InputError
-from models.session import (
+from trueflight.models import access
+from trueflight.models.access import Keys
+from trueflight.models.errors import InputError
+from trueflight.models.session import (
     CONNECT,
     ENCRYPTED,
     LISTEN,

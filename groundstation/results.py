@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from models.flight import Flight
-from models.model import Model
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model
 
 
 @dataclass(frozen=True)

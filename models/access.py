@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from models.errors import InputError
-from models.outside import read_toml
+from trueflight.models.errors import InputError
+from trueflight.models.outside import read_toml
 
 ROLES = OBSERVER, OPERATOR, ENGINEER = ("observer", "operator", "engineer")
 """What a person may be, each with the rights of those before."""

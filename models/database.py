@@ -17,11 +17,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from models.errors import InputError
-from models.outside import read_text
-from models.reference import trajectory
-from models.trajectory import Trajectory
-from models.whole_file import write_whole
+from trueflight.models.errors import InputError
+from trueflight.models.outside import read_text
+from trueflight.models.reference import trajectory
+from trueflight.models.trajectory import Trajectory
+from trueflight.models.whole_file import write_whole
 
 MINUTES = 30.0
 """Flight time of a database unless told otherwise, as in the paper."""

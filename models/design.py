@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from models.errors import InputError
-from models.outside import is_number, json_object, numbers, read_text, shown
-from models.vehicle import GRAVITY, Vehicle
-from models.whole_file import write_whole
+from trueflight.models.errors import InputError
+from trueflight.models.outside import is_number, json_object, numbers, read_text, shown
+from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.models.whole_file import write_whole
 
 Matrix = tuple[tuple[float, ...], ...]
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
-from models.flight import Flight
-from models.vehicle import Vehicle
+from trueflight.models.flight import Flight
+from trueflight.models.vehicle import Vehicle
 
 Array = Any
 """An array of any library that follows the Array API standard."""

@@ -12,14 +12,14 @@ import numpy as np
 import onnx
 import torch
 
-from models import contract
-from models.effect import Stage
-from models.export_graph import simplify
-from models.features import feature_matrix, feature_names, features_of_flight
-from models.flight import Flight
-from models.model import Model
-from models.network import folded_layers
-from models.prediction import error_acceleration, motion_of_features
+from trueflight.models import contract
+from trueflight.models.effect import Stage
+from trueflight.models.export_graph import simplify
+from trueflight.models.features import feature_matrix, feature_names, features_of_flight
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model
+from trueflight.models.network import folded_layers
+from trueflight.models.prediction import error_acceleration, motion_of_features
 
 GOLDEN = 8
 """Golden vectors in each file."""

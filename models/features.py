@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from models.contract import FEATURES, YAW_FEATURES
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import euler_from_quaternion, heading_from_world
+from trueflight.models.contract import FEATURES, YAW_FEATURES
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import euler_from_quaternion, heading_from_world
 
 NEEDS_YAW = ("wind",)
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from models.errors import InputError
-from models.vehicle import Vehicle
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle
 
 COLUMNS: dict[str, tuple[tuple[str, ...], str, str]] = {
     # attribute: (names in the project's own CSV, unit, what it is)

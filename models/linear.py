@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from array_api_compat import array_namespace
 
-from models.effect import Array
-from models.vehicle import GRAVITY
+from trueflight.models.effect import Array
+from trueflight.models.vehicle import GRAVITY
 
 
 def hover_acceleration(phi: Array, theta: Array, specific_thrust: Array) -> Array:

@@ -8,13 +8,13 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from models.effect import Effect
-from models.effects import catalogue, effect_named
-from models.errors import InputError
-from models.network import Network, network_effect, network_from_table, network_table
-from models.outside import is_number, json_object, read_text, shown
-from models.vehicle import Vehicle, vehicle_from_table
-from models.whole_file import whole_file
+from trueflight.models.effect import Effect
+from trueflight.models.effects import catalogue, effect_named
+from trueflight.models.errors import InputError
+from trueflight.models.network import Network, network_effect, network_from_table, network_table
+from trueflight.models.outside import is_number, json_object, read_text, shown
+from trueflight.models.vehicle import Vehicle, vehicle_from_table
+from trueflight.models.whole_file import whole_file
 
 _RESTORE = "restore it from a copy"
 

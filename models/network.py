@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace
 
-from models.contract import FEATURES, YAW_FEATURES
-from models.effect import Array, Effect, Motion, Stage
-from models.errors import InputError
-from models.outside import shown
+from trueflight.models.contract import FEATURES, YAW_FEATURES
+from trueflight.models.effect import Array, Effect, Motion, Stage
+from trueflight.models.errors import InputError
+from trueflight.models.outside import shown
 
 Layer = tuple[Array, Array]
 """Weights (outputs, inputs) and biases (outputs,)."""

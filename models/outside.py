@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 MOST_TEXT = 64 << 20
 """Bytes of a settings, vehicle, design or model file; the largest network allowed in one has less."""

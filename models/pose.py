@@ -18,7 +18,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from models.errors import shown
+from trueflight.models.errors import shown
 
 _FARTHEST = 1e5
 """m: farther than motion capture and vision see, and small enough for what the autopilot is sent."""

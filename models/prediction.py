@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace
 
-from models.effect import Array, Effect, Motion, Stage
-from models.flight import Flight
-from models.frames import euler_from_quaternion, heading_from_world, rotation_matrix
-from models.lag import delayed, lagged
-from models.linear import hover_acceleration
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.models.effect import Array, Effect, Motion, Stage
+from trueflight.models.flight import Flight
+from trueflight.models.frames import euler_from_quaternion, heading_from_world, rotation_matrix
+from trueflight.models.lag import delayed, lagged
+from trueflight.models.linear import hover_acceleration
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 Chain = Sequence[tuple[Effect, Mapping[str, Any]]]
 """Effects with parameter values, in the order in which they were added."""

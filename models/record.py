@@ -25,12 +25,12 @@ from mcap.exceptions import EndOfFile, InvalidMagic
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from models.design import Design, design_from_json, design_to_json
-from models.errors import InputError
-from models.mcap_records import mcap_records
-from models.outside import toml_table, unreadable
-from models.record_pb2 import DESCRIPTOR, Event, Tick
-from models.vehicle import Vehicle, vehicle_from_table
+from trueflight.models.design import Design, design_from_json, design_to_json
+from trueflight.models.errors import InputError
+from trueflight.models.mcap_records import mcap_records
+from trueflight.models.outside import toml_table, unreadable
+from trueflight.models.record_pb2 import DESCRIPTOR, Event, Tick
+from trueflight.models.vehicle import Vehicle, vehicle_from_table
 
 TICK_TOPIC, EVENT_TOPIC = "/tick", "/event"
 CHUNK_BYTES = 16 * 1024

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.contract import REQUEST_BYTES
-from models.errors import InputError, shown
-from models.trajectory import (
+from trueflight.models.contract import REQUEST_BYTES
+from trueflight.models.errors import InputError, shown
+from trueflight.models.trajectory import (
     Curve,
     ReferenceColumns,
     ReferenceSample,

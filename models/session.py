@@ -16,7 +16,7 @@ from typing import Any
 
 import zenoh
 
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 ENCRYPTED = ("tls", "quic")
 _LOCAL = ("unixsock-stream", "unixpipe")

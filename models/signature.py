@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 LIMIT = 4096
 """Bytes of a signature at most; nothing longer is parsed."""

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from models.errors import InputError
-from models.outside import is_number, numbers, read_toml, shown
+from trueflight.models.errors import InputError
+from trueflight.models.outside import is_number, numbers, read_toml, shown
 
 GRAVITY = 9.81
 """Standard gravity of the project, m/s²."""

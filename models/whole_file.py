@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 _LONGEST = 60
 """Characters of a file's name that stand in the name of its unfinished one: a name may have 255 bytes."""

@@ -7,9 +7,9 @@ import struct
 from collections import deque
 from enum import IntEnum
 
-from sim_bridge.modes import Mode
-from sim_bridge.parameters import Parameters
-from sim_bridge.position_control import (
+from trueflight.sim_bridge.modes import Mode
+from trueflight.sim_bridge.parameters import Parameters
+from trueflight.sim_bridge.position_control import (
     FREE,
     UNSET,
     AttitudeSetpoint,
@@ -22,8 +22,8 @@ from sim_bridge.position_control import (
     tilt_of,
     yaw_of,
 )
-from sim_bridge.simulator import Simulator
-from sim_bridge.world import PHYSICS_STEP
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.world import PHYSICS_STEP
 
 _OUTER_STEPS = 5  # position loop and supervision at 100 Hz
 _ATTITUDE_STEPS = 2  # attitude loop at 250 Hz, PX4's

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from models.errors import InputError, run_command_line
-from models.vehicle import Vehicle, load_vehicle
-from sim_bridge.settings import Settings, load_settings
+from trueflight.models.errors import InputError, run_command_line
+from trueflight.models.vehicle import Vehicle, load_vehicle
+from trueflight.sim_bridge.settings import Settings, load_settings
 
 if TYPE_CHECKING:
-    from sim_bridge.autopilot import Autopilot
-    from sim_bridge.truth.hidden import Hidden
+    from trueflight.sim_bridge.autopilot import Autopilot
+    from trueflight.sim_bridge.truth.hidden import Hidden
 
 app = typer.Typer(
     name="sim-bridge",
@@ -61,7 +61,7 @@ def _seal(settings: Settings, hidden: tuple[Hidden, ...], vehicle: Vehicle, defa
     """Seal what is hidden and return where (None: the user knows it already). Last of all, when nothing can
     fail: the answer to an earlier flight must not be lost to a mistyped one.
     """
-    from sim_bridge.seal import seal
+    from trueflight.sim_bridge.seal import seal
 
     if not settings.sealed and not {"random", "any", "rich"} & set(settings.hidden):
         return None
@@ -114,11 +114,11 @@ def run(
     flags |= {"charge": charge, "battery_age": battery_age}
     settings = load_settings(config, flags | {"pilot_takes_over_at": pilot_takes_over_at})
     believed = load_vehicle(settings.vehicle)
-    from sim_bridge.autopilot import Autopilot
-    from sim_bridge.mavlink.server import PILOT_MODES, Link, Server, pilot_order
-    from sim_bridge.parameters import Parameters
-    from sim_bridge.simulator import Simulator
-    from sim_bridge.truth.hidden import choose
+    from trueflight.sim_bridge.autopilot import Autopilot
+    from trueflight.sim_bridge.mavlink.server import PILOT_MODES, Link, Server, pilot_order
+    from trueflight.sim_bridge.parameters import Parameters
+    from trueflight.sim_bridge.simulator import Simulator
+    from trueflight.sim_bridge.truth.hidden import choose
 
     if settings.pilot_mode not in PILOT_MODES:
         raise InputError(f"--pilot-mode {settings.pilot_mode}: choose one of {', '.join(PILOT_MODES)}")
@@ -229,10 +229,10 @@ def sitl(
     flags = {name: value for name, value in locals().items() if name in names}
     settings = load_settings(config, flags, free_speed=speed)
     believed = load_vehicle(settings.vehicle)
-    from sim_bridge.sitl.lockstep import Position
-    from sim_bridge.sitl.session import Request, fly, parameter_lines
-    from sim_bridge.truth.hidden import choose
-    from sim_bridge.world import check_vehicle
+    from trueflight.sim_bridge.sitl.lockstep import Position
+    from trueflight.sim_bridge.sitl.session import Request, fly, parameter_lines
+    from trueflight.sim_bridge.truth.hidden import choose
+    from trueflight.sim_bridge.world import check_vehicle
 
     check_vehicle(believed)
     kinds = [kind.value for kind in Position]
@@ -324,10 +324,10 @@ def fly(
     )
     settings = load_settings(config, {name: value for name, value in locals().items() if name in names})
     believed = load_vehicle(settings.vehicle)
-    from companion.controllers import TrimLimits
-    from models.design import load_design
-    from sim_bridge.in_process import Plan, record
-    from sim_bridge.truth.hidden import choose
+    from trueflight.companion.controllers import TrimLimits
+    from trueflight.models.design import load_design
+    from trueflight.sim_bridge.in_process import Plan, record
+    from trueflight.sim_bridge.truth.hidden import choose
 
     gains = Path(settings.design) if settings.design else Path(settings.vehicle).with_name("design.json")
     plan = Plan(
@@ -375,7 +375,7 @@ def fly(
 
 
 def _trajectory(name: str, assignments: list[str]) -> Any:
-    from models.reference import trajectory, trajectory_from_csv
+    from trueflight.models.reference import trajectory, trajectory_from_csv
 
     if name.endswith(".csv"):
         return trajectory_from_csv(_bytes(Path(name)).decode("utf-8", "replace"), name)
@@ -461,12 +461,12 @@ def collect(
     names = ("vehicle", "design", "hidden", "hidden_count", "seed", "sealed", "noise", "battery_age")
     settings = load_settings(config, {name: value for name, value in locals().items() if name in names})
     believed = load_vehicle(settings.vehicle)
-    from models.database import Collection, database
-    from models.design import load_design
-    from sim_bridge.collect import collect as fly_all
-    from sim_bridge.collect import fingerprint, flights
-    from sim_bridge.in_process import Plan
-    from sim_bridge.truth.hidden import choose
+    from trueflight.models.database import Collection, database
+    from trueflight.models.design import load_design
+    from trueflight.sim_bridge.collect import collect as fly_all
+    from trueflight.sim_bridge.collect import fingerprint, flights
+    from trueflight.sim_bridge.in_process import Plan
+    from trueflight.sim_bridge.truth.hidden import choose
 
     gains = Path(settings.design) if settings.design else Path(settings.vehicle).with_name("design.json")
     sorties = database(settings.seed, minutes)
@@ -553,7 +553,7 @@ def _print_collected(entries: list[dict[str, Any]]) -> None:
 @app.command(epilog="Example: sim-bridge reveal hidden.sealed --json")
 def reveal(file: Path, as_json: Json = False) -> None:
     """Tell what was hidden, from its sealed file."""
-    from sim_bridge.seal import reveal as open_seal
+    from trueflight.sim_bridge.seal import reveal as open_seal
 
     answer: dict[str, Any] = open_seal(file)
     lines = []
@@ -576,7 +576,7 @@ def pilot(
     as_json: Json = False,
 ) -> None:
     """Take over a running simulation as its pilot: switch the flight mode, or kill."""
-    from sim_bridge.pilot import send_order
+    from trueflight.sim_bridge.pilot import send_order
 
     answer = send_order(mode, port)
     if not answer.get("accepted"):
@@ -587,7 +587,7 @@ def pilot(
 @app.command(epilog="Example: sim-bridge effects --json")
 def effects(as_json: Json = False) -> None:
     """List what can be hidden, with the range of its size when it is drawn, by name or `random`, and by `rich`."""
-    from sim_bridge.truth.hidden import EFFECTS, RICH, pool
+    from trueflight.sim_bridge.truth.hidden import EFFECTS, RICH, pool
 
     rows: list[dict[str, Any]] = [
         {

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from models.database import Collection, Sortie, record_name
-from models.design import design_to_json
-from models.errors import InputError
-from models.record import vehicle_to_toml
-from models.workers import interrupts_held, worker_pool
-from sim_bridge.in_process import Flown, Plan, record
-from sim_bridge.truth.battery import BatteryState
+from trueflight.models.database import Collection, Sortie, record_name
+from trueflight.models.design import design_to_json
+from trueflight.models.errors import InputError
+from trueflight.models.record import vehicle_to_toml
+from trueflight.models.workers import interrupts_held, worker_pool
+from trueflight.sim_bridge.in_process import Flown, Plan, record
+from trueflight.sim_bridge.truth.battery import BatteryState
 
 
 @dataclass(frozen=True)

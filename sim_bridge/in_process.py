@@ -14,24 +14,24 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.control import ControlLaw, ControlStep, State
-from companion.controllers import Preview, TrimLimits, make_controller
-from companion.guard import Guard
-from companion.inference import check_model
-from models.contract import CORRECTED, LQR
-from models.design import Design
-from models.errors import InputError
-from models.flight import COLUMNS
-from models.record import FlightRecorder
-from models.record_pb2 import Event, Tick
-from models.trajectory import ReferenceSample, Trajectory, transfer
-from models.vehicle import Vehicle
-from models.whole_file import whole_file
-from sim_bridge.simulator import Simulator
-from sim_bridge.truth.battery import FULL, BatteryState
-from sim_bridge.truth.hidden import Hidden
-from sim_bridge.truth.sensors import Estimate, Noise
-from sim_bridge.world import PHYSICS_STEP
+from trueflight.companion.control import ControlLaw, ControlStep, State
+from trueflight.companion.controllers import Preview, TrimLimits, make_controller
+from trueflight.companion.guard import Guard
+from trueflight.companion.inference import check_model
+from trueflight.models.contract import CORRECTED, LQR
+from trueflight.models.design import Design
+from trueflight.models.errors import InputError
+from trueflight.models.flight import COLUMNS
+from trueflight.models.record import FlightRecorder
+from trueflight.models.record_pb2 import Event, Tick
+from trueflight.models.trajectory import ReferenceSample, Trajectory, transfer
+from trueflight.models.vehicle import Vehicle
+from trueflight.models.whole_file import whole_file
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.truth.battery import FULL, BatteryState
+from trueflight.sim_bridge.truth.hidden import Hidden
+from trueflight.sim_bridge.truth.sensors import Estimate, Noise
+from trueflight.sim_bridge.world import PHYSICS_STEP
 
 _LOST = 4.0  # m from the reference at which a flight is given up, as the companion does
 _BETWEEN_SPEED, _BETWEEN_ACCELERATION = 1.5, 2.0  # m/s, m/s²: from the end back to the start
@@ -290,7 +290,7 @@ class _TickWriter:
             setpoint_sent=True,
         )
         if plan.model is not None:
-            from models.contract import model_hash
+            from trueflight.models.contract import model_hash
 
             self._tick.model = model_hash(plan.model)
         self.time_us = 0

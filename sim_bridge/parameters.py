@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from models.errors import InputError
-from models.vehicle import Vehicle
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle
 
 
 @dataclass(frozen=True)

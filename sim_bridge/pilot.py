@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 
 def send_order(mode: str, port: int, timeout: float = 2.0) -> dict[str, object]:

@@ -7,9 +7,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from models.vehicle import GRAVITY, Vehicle
-from sim_bridge.parameters import Parameters
-from sim_bridge.truth.sensors import Estimate
+from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.sim_bridge.parameters import Parameters
+from trueflight.sim_bridge.truth.sensors import Estimate
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

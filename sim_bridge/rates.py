@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from models.vehicle import GRAVITY, Vehicle
-from sim_bridge.truth.airframe import believed_powertrain
+from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.sim_bridge.truth.airframe import believed_powertrain
 
 IDLE_SHARE = 0.03
 """Lowest thrust of a running rotor, as a share of its hover thrust (PX4's PWM_MAIN_MIN keeps rotors

@@ -14,9 +14,9 @@ import zlib
 from itertools import cycle
 from pathlib import Path
 
-from models.errors import InputError
-from models.whole_file import write_whole
-from sim_bridge.truth.hidden import Hidden
+from trueflight.models.errors import InputError
+from trueflight.models.whole_file import write_whole
+from trueflight.sim_bridge.truth.hidden import Hidden
 
 _HEADER = "trueflight sealed answer 1: open it with `sim-bridge reveal`"
 _MASK = hashlib.sha256(b"look at the residual first").digest()

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from models.errors import InputError
-from models.outside import is_number, read_toml, shown
-from sim_bridge.truth.battery import BatteryState
-from sim_bridge.truth.sensors import NO_NOISE, Noise
+from trueflight.models.errors import InputError
+from trueflight.models.outside import is_number, read_toml, shown
+from trueflight.sim_bridge.truth.battery import BatteryState
+from trueflight.sim_bridge.truth.sensors import NO_NOISE, Noise
 
 
 @dataclass(frozen=True)

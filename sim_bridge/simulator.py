@@ -10,14 +10,14 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from models.frames import rotation_matrix
-from models.vehicle import Vehicle
-from sim_bridge.rates import RateController
-from sim_bridge.truth.airframe import believed_powertrain
-from sim_bridge.truth.battery import FULL, BatteryState, in_state
-from sim_bridge.truth.hidden import Hidden, after_takeoff, install
-from sim_bridge.truth.sensors import Estimate, Noise, Sensors
-from sim_bridge.world import PHYSICS_STEP, World
+from trueflight.models.frames import rotation_matrix
+from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.rates import RateController
+from trueflight.sim_bridge.truth.airframe import believed_powertrain
+from trueflight.sim_bridge.truth.battery import FULL, BatteryState, in_state
+from trueflight.sim_bridge.truth.hidden import Hidden, after_takeoff, install
+from trueflight.sim_bridge.truth.sensors import Estimate, Noise, Sensors
+from trueflight.sim_bridge.world import PHYSICS_STEP, World
 
 _STEP_US = round(PHYSICS_STEP * 1e6)
 _LEFT_GROUND = 0.05  # m above standing at which the time after take-off begins

@@ -8,8 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from models.errors import InputError
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 PHYSICS_STEP = 0.002
 """Time step of the physics, s (500 Hz)."""

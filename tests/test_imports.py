@@ -8,17 +8,20 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 STANDARD = sys.stdlib_module_names
-EVERYWHERE = {"numpy", "typer", "rich", "models"}
+EVERYWHERE = {"numpy", "typer", "rich", "trueflight.models"}
 
 ALLOWED = {
     "models": {"array_api_compat", "mcap", "lz4", "zstandard", "google"},
-    "companion": {"companion", "mavsdk", "zenoh", "onnxruntime", "mcap", "google"},
+    "companion": {"trueflight.companion", "mavsdk", "zenoh", "onnxruntime", "mcap", "google"},
     "groundstation": {
-        "groundstation", "torch", "control", "scipy", "statsmodels", "rerun", "pyarrow", "pyulog", "onnx",
+        "trueflight.groundstation", "torch", "control", "scipy", "statsmodels", "rerun", "pyarrow", "pyulog", "onnx",
         "onnxruntime", "mcap", "mcap_ros2", "google", "zenoh", "jinja2", "markupsafe", "matplotlib", "dask",
         "distributed", "cryptography",
     },
-    "sim_bridge": {"sim_bridge", "companion", "mujoco", "pymavlink", "scipy", "mcap", "google", "onnxruntime"},
+    "sim_bridge": {
+        "trueflight.sim_bridge", "trueflight.companion", "mujoco", "pymavlink", "scipy", "mcap", "google",
+        "onnxruntime",
+    },
 }  # fmt: skip
 FITS_OR_EXPORTS = {"models/export.py": {"torch", "onnx"}, "models/export_graph.py": {"torch"}}
 """The modules of models/ that may import torch: they fit, train or export, on the ground."""
@@ -42,6 +45,12 @@ def imports(path: Path) -> set[str]:
     return found
 
 
+def _owner(name: str) -> str:
+    """The library that a module belongs to; of our own, the folder."""
+    parts = name.split(".")
+    return ".".join(parts[:2]) if parts[0] == "trueflight" else parts[0]
+
+
 @pytest.mark.parametrize("package", sorted(ALLOWED))
 def test_a_package_imports_only_what_its_role_allows(package: str) -> None:
     for path in sorted((ROOT / package).rglob("*.py")):
@@ -52,13 +61,19 @@ def test_a_package_imports_only_what_its_role_allows(package: str) -> None:
             | ALLOWED[package]
             | (FITS_OR_EXPORTS | OPENS_OR_SIGNS).get(path.relative_to(ROOT).as_posix(), set())
         )
-        foreign = {name.split(".")[0] for name in imports(path)} - STANDARD - allowed
+        foreign = {_owner(name) for name in imports(path)} - STANDARD - allowed
         assert not foreign, f"{path.relative_to(ROOT)} imports {sorted(foreign)}"
 
 
 @pytest.mark.parametrize("package", ["sim_bridge", "companion"])
 def test_neither_simulator_nor_companion_sees_the_effects(package: str) -> None:
-    forbidden = ("models.effect", "models.effects", "models.model", "models.prediction", "models.export")
+    forbidden = (
+        "trueflight.models.effect",
+        "trueflight.models.effects",
+        "trueflight.models.model",
+        "trueflight.models.prediction",
+        "trueflight.models.export",
+    )
     for path in sorted((ROOT / package).rglob("*.py")):
         seen = {name for name in imports(path) if name.startswith(forbidden)}
         assert not seen, f"{path.relative_to(ROOT)} imports {sorted(seen)}"
@@ -66,10 +81,12 @@ def test_neither_simulator_nor_companion_sees_the_effects(package: str) -> None:
 
 def test_groundstation_never_imports_the_simulator() -> None:
     for path in sorted((ROOT / "groundstation").rglob("*.py")):
-        assert not any(n.startswith("sim_bridge") for n in imports(path)), path
+        assert not any(n.startswith("trueflight.sim_bridge") for n in imports(path)), path
 
 
-@pytest.mark.parametrize("module", ["companion.cli", "companion.flight", "sim_bridge.cli"])
+@pytest.mark.parametrize(
+    "module", ["trueflight.companion.cli", "trueflight.companion.flight", "trueflight.sim_bridge.cli"]
+)
 def test_a_light_process_loads_no_heavy_library(module: str) -> None:
     import subprocess
 
@@ -80,7 +97,13 @@ def test_a_light_process_loads_no_heavy_library(module: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["companion.inference", "companion.inspection", "groundstation.commands.app", "models.export"]
+    "module",
+    [
+        "trueflight.companion.inference",
+        "trueflight.companion.inspection",
+        "trueflight.groundstation.commands.app",
+        "trueflight.models.export",
+    ],
 )
 def test_onnxruntime_tells_nobody_of_what_it_runs(module: str) -> None:
     """Its builds send events to their maker, unless told otherwise before they are loaded."""

@@ -11,14 +11,14 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from models.errors import InputError
-from models.whole_file import write_whole
+from trueflight.models.errors import InputError
+from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from groundstation.evaluate.side_by_side import SideBySide
-    from models.design import Design
-    from models.flight import Flight
-    from models.model import Model
+    from trueflight.groundstation.evaluate.side_by_side import SideBySide
+    from trueflight.models.design import Design
+    from trueflight.models.flight import Flight
+    from trueflight.models.model import Model
 
 console = Console()
 model_app = typer.Typer(no_args_is_help=True, help="Make, list, show and export model versions.")
@@ -63,7 +63,7 @@ def print_json(table: Any) -> None:
 
 
 def _read(path: Path, vehicle: Path | None, mapping: Path | None) -> Flight:
-    from groundstation.reading import read_flight
+    from trueflight.groundstation.reading import read_flight
 
     return read_flight(path, vehicle, mapping)
 
@@ -72,8 +72,8 @@ def chosen_model(which: str | None, flight: Flight, store: Path, effects: Path |
     """The model asked for; else the newest version of the vehicle; else linear with exact rotation."""
     from dataclasses import replace
 
-    from groundstation.versions.store import find, newest
-    from models.model import linear_model, rigid_body_model
+    from trueflight.groundstation.versions.store import find, newest
+    from trueflight.models.model import linear_model, rigid_body_model
 
     directory = None if effects is None else str(effects)
     if which == "linear":
@@ -127,10 +127,10 @@ def compare_command(
 
     Example: groundstation compare before.csv after.csv --save compare.rrd -o compare.html
     """
-    from groundstation.evaluate.compare import compare
-    from groundstation.evaluate.where import where_it_fails
-    from groundstation.output import as_json as tables_json
-    from groundstation.output.tables import print_comparisons, print_where
+    from trueflight.groundstation.evaluate.compare import compare
+    from trueflight.groundstation.evaluate.where import where_it_fails
+    from trueflight.groundstation.output import as_json as tables_json
+    from trueflight.groundstation.output.tables import print_comparisons, print_where
 
     if len(flights) > 1 or len(model or ()) > 1:
         read = _read_all(flights, vehicle, mapping)
@@ -144,11 +144,11 @@ def compare_command(
     results = [compare(flight, m, bandwidth) for m in line]
     where = where_it_fails(results[-1])
     if save is not None:
-        from groundstation.views import write_comparison
+        from trueflight.groundstation.views import write_comparison
 
         write_comparison(save, results, where)
     if output is not None:
-        from groundstation.evaluate.side_by_side import side_by_side
+        from trueflight.groundstation.evaluate.side_by_side import side_by_side
 
         _write_side_by_side_report(output, side_by_side([flight], [line], bandwidth))
     if as_json:
@@ -170,7 +170,7 @@ def compare_command(
 
 def _read_all(paths: list[Path], vehicle: Path | None, mapping: Path | None) -> list[Flight]:
     """The flights, named apart; a flight without a vehicle file of its own has that of the first."""
-    from groundstation.evaluate.side_by_side import told_apart
+    from trueflight.groundstation.evaluate.side_by_side import told_apart
 
     read = [_read(paths[0], vehicle, mapping)]
     read += [read_other(path, vehicle, mapping, read[0]) for path in paths[1:]]
@@ -195,14 +195,14 @@ def _compare_side_by_side(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    from groundstation.evaluate.side_by_side import side_by_side
-    from groundstation.output.as_json import side_by_side_table
-    from groundstation.output.tables import print_side_by_side
+    from trueflight.groundstation.evaluate.side_by_side import side_by_side
+    from trueflight.groundstation.output.as_json import side_by_side_table
+    from trueflight.groundstation.output.tables import print_side_by_side
 
     with nullcontext() if as_json else console.status("comparing"):
         beside = side_by_side(flights, models, bandwidth)
         if save is not None:
-            from groundstation.views import write_side_by_side
+            from trueflight.groundstation.views import write_side_by_side
 
             write_side_by_side(save, beside)
         made = None if output is None else _write_side_by_side_report(output, beside)
@@ -223,9 +223,9 @@ def _write_side_by_side_report(path: Path, beside: SideBySide) -> dict[str, Any]
     """Write the page; returns the JSON it was written from."""
     from dataclasses import asdict
 
-    from groundstation.evaluate.analysis import provenance
-    from groundstation.output.as_json import side_by_side_table
-    from groundstation.report import render_side_by_side, write_report
+    from trueflight.groundstation.evaluate.analysis import provenance
+    from trueflight.groundstation.output.as_json import side_by_side_table
+    from trueflight.groundstation.report import render_side_by_side, write_report
 
     made = provenance(*(("flight", c.flight) for c in beside.comparisons))
     table = {"side_by_side": side_by_side_table(beside), "provenance": asdict(made)}
@@ -243,7 +243,7 @@ def print_written(save: Path | None, output: Path | None) -> None:
 
 def lineage_of(model: Model, store: Path) -> list[Model]:
     """The models from the linear one to `model`."""
-    from groundstation.versions.store import lineage
+    from trueflight.groundstation.versions.store import lineage
 
     return lineage(store, model)
 
@@ -263,16 +263,16 @@ def where_command(
 
     Example: groundstation where identify.csv --vehicle vehicle.toml --save where.rrd
     """
-    from groundstation.evaluate.compare import compare
-    from groundstation.evaluate.where import where_it_fails
-    from groundstation.output import as_json as tables_json
-    from groundstation.output.tables import print_where
+    from trueflight.groundstation.evaluate.compare import compare
+    from trueflight.groundstation.evaluate.where import where_it_fails
+    from trueflight.groundstation.output import as_json as tables_json
+    from trueflight.groundstation.output.tables import print_where
 
     read = _read(flight, vehicle, mapping)
     result = compare(read, chosen_model(model, read, store, effects), bandwidth, horizons=False)
     where = where_it_fails(result)
     if save is not None:
-        from groundstation.views import write_where
+        from trueflight.groundstation.views import write_where
 
         write_where(save, result, where)
     if as_json:
@@ -312,16 +312,16 @@ def diagnose_command(
 
     Example: groundstation diagnose identify.csv --vehicle vehicle.toml --validate validate.csv --save analysis.rrd
     """
-    from groundstation.identify.translation import diagnose
-    from groundstation.output.as_json import analysis_table, diagnosis_table
-    from groundstation.output.tables import print_diagnosis
+    from trueflight.groundstation.identify.translation import diagnose
+    from trueflight.groundstation.output.as_json import analysis_table, diagnosis_table
+    from trueflight.groundstation.output.tables import print_diagnosis
 
     read = _read(flight, vehicle, mapping)
     held_out = None if validate is None else _read(validate, vehicle or same_vehicle(read), mapping)
     if thrust not in ("command", "rotors"):
         raise InputError(f"--thrust {thrust}: choose command or rotors")
     if thrust == "rotors":
-        from groundstation.identify.rotors import thrust_from_rotors
+        from trueflight.groundstation.identify.rotors import thrust_from_rotors
 
         read = thrust_from_rotors(read)
         held_out = None if held_out is None else thrust_from_rotors(held_out)
@@ -332,8 +332,8 @@ def diagnose_command(
             result = diagnose(read, line[-1], held_out, bandwidth, progress=progress)
             table = diagnosis_table(result)
         else:
-            from groundstation.evaluate.analysis import analyse
-            from groundstation.views import write_analysis
+            from trueflight.groundstation.evaluate.analysis import analyse
+            from trueflight.groundstation.views import write_analysis
 
             whole = analyse(read, line, held_out, bandwidth, design_of(flight, None, read), progress=progress)
             result, table = whole.diagnosis, {**analysis_table(whole), "recording": str(save)}
@@ -347,7 +347,7 @@ def diagnose_command(
 
 def starting_line(which: str | None, flight: Flight, store: Path, effects: Path | None) -> list[Model]:
     """The models that led to the one a diagnosis starts from, that one last; exact rotation is always in it."""
-    from models.model import rigid_body_model
+    from trueflight.models.model import rigid_body_model
 
     base = chosen_model(which, flight, store, effects)
     if "rigid_body" not in base.names():
@@ -362,12 +362,12 @@ def starting_line(which: str | None, flight: Flight, store: Path, effects: Path 
 
 def design_of(path: Path, design: Path | None, flight: Flight) -> Design | None:
     """The design that a flight was flown by: the one given, else that of the record; None where there is none."""
-    from models.design import load_design
+    from trueflight.models.design import load_design
 
     if design is not None:
         return load_design(design, flight.vehicle)
     if path.suffix.lower() == ".mcap":
-        from models.record import read_record
+        from trueflight.models.record import read_record
 
         return read_record(path).design
     return None
@@ -396,7 +396,7 @@ def demo_command(
 
     Example: groundstation demo --seed 7
     """
-    from groundstation.commands.demo import demonstrate, real_flights
+    from trueflight.groundstation.commands.demo import demonstrate, real_flights
 
     demonstrate(output, seed, hidden or [], console, viewer)
     if real:
@@ -414,7 +414,7 @@ def effects_command(
     """
     from rich.table import Table
 
-    from models.effects import catalogue, effect_named
+    from trueflight.models.effects import catalogue, effect_named
 
     directory = None if effects is None else str(effects)
     shown = list(catalogue(directory).values()) if name is None else [effect_named(name, directory)]
@@ -487,11 +487,11 @@ def model_add(
 
     Example: groundstation model add rotor_drag --flight identify.csv --validate validate.csv
     """
-    from groundstation.evaluate.compare import compare, waterfall
-    from groundstation.output import as_json as tables_json
-    from groundstation.output.tables import print_waterfall
-    from groundstation.versions.store import add_effect, lineage
-    from groundstation.versions.store import save as save_version
+    from trueflight.groundstation.evaluate.compare import compare, waterfall
+    from trueflight.groundstation.output import as_json as tables_json
+    from trueflight.groundstation.output.tables import print_waterfall
+    from trueflight.groundstation.versions.store import add_effect, lineage
+    from trueflight.groundstation.versions.store import save as save_version
 
     read = _read(flight, vehicle, mapping)
     held_out = None if validate is None else _read(validate, vehicle or same_vehicle(read), mapping)
@@ -502,7 +502,7 @@ def model_add(
     line = lineage(store, made)
     steps = waterfall(read, held_out, line, bandwidth)
     if save is not None:
-        from groundstation.views import write_before_after
+        from trueflight.groundstation.views import write_before_after
 
         shown = read if held_out is None else held_out
         before, after = (compare(shown, m, bandwidth, horizons=False) for m in (line[0], made))
@@ -545,9 +545,9 @@ def model_list(
     """
     from rich.table import Table
 
-    from groundstation.output.as_json import model_table
-    from groundstation.versions.store import versions
-    from models.model import read_model
+    from trueflight.groundstation.output.as_json import model_table
+    from trueflight.groundstation.versions.store import versions
+    from trueflight.models.model import read_model
 
     if not store.is_dir():
         raise InputError(
@@ -594,8 +594,8 @@ def model_show(
 
     Example: groundstation model show v2 --vehicle-name quad5
     """
-    from groundstation.output.as_json import model_table
-    from groundstation.versions.store import find
+    from trueflight.groundstation.output.as_json import model_table
+    from trueflight.groundstation.versions.store import find
 
     model = find(store, vehicle or _only_vehicle(store), which)
     if as_json:
@@ -650,10 +650,10 @@ def model_export(
 
     Example: groundstation model export v2 --flight identify.csv -o correction.onnx
     """
-    from groundstation.identify.actuation import actuation_of
-    from groundstation.versions.store import find
-    from models.contract import model_hash
-    from models.export import export_onnx, not_exported
+    from trueflight.groundstation.identify.actuation import actuation_of
+    from trueflight.groundstation.versions.store import find
+    from trueflight.models.contract import model_hash
+    from trueflight.models.export import export_onnx, not_exported
 
     flights = [_read(path, vehicle, mapping) for path in flight]
     model = find(store, flights[0].vehicle.name, which)

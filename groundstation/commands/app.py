@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from groundstation.commands import (
+from trueflight.groundstation.commands import (
     analysis,
     bound,
     calibrate,
@@ -20,7 +20,7 @@ from groundstation.commands import (
     survey,
     train,
 )
-from models.errors import run_command_line
+from trueflight.models.errors import run_command_line
 
 app = typer.Typer(
     name="groundstation",

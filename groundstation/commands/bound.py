@@ -10,10 +10,10 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from groundstation.commands.analysis import print_json
+from trueflight.groundstation.commands.analysis import print_json
 
 if TYPE_CHECKING:
-    from groundstation.evaluate.bound import Tube
+    from trueflight.groundstation.evaluate.bound import Tube
 
 console = Console()
 
@@ -63,14 +63,14 @@ def bound_command(
     d is by how much the acceleration differs from what the linear design has. As long as |d| keeps below its bound,
     the error decays into a ball around the linear design's own flight (or around the reference) and stays there.
     """
-    from groundstation.evaluate.bound import predict_tube
-    from groundstation.evaluate.tracking import read_designed
+    from trueflight.groundstation.evaluate.bound import predict_tube
+    from trueflight.groundstation.evaluate.tracking import read_designed
 
     flown, believed, label = read_designed(flight, design, vehicle)
     source = None if bound_from is None else read_designed(bound_from, design, vehicle)[0]
     tube = predict_tube(flown, believed, label, around.value, source, bandwidth)
     if rrd is not None:
-        from groundstation.views import write_tube
+        from trueflight.groundstation.views import write_tube
 
         write_tube(rrd, tube)
     if as_json:

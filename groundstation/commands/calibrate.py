@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from groundstation.commands.analysis import JsonOption, print_json
-from models.errors import InputError
+from trueflight.groundstation.commands.analysis import JsonOption, print_json
+from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
-    from groundstation.evaluate.calibration import Calibration, Case, Proportion
+    from trueflight.groundstation.evaluate.calibration import Calibration, Case, Proportion
 
 console = Console()
 
@@ -63,10 +63,16 @@ def calibrate_command(
     hide, at two levels of noise, with and without rotor speeds, on surveys, tasks, gentle flights and fast descents.
     Writes report.html, its charts as PNG, and calibration.json into the folder.
     """
-    from groundstation.evaluate.calibration import calibrate
-    from groundstation.output.as_json import calibration_table
-    from groundstation.report.calibration import write_calibration
-    from groundstation.study.calibration_study import Study, forget_diagnoses, hideable, run, sorties
+    from trueflight.groundstation.evaluate.calibration import calibrate
+    from trueflight.groundstation.output.as_json import calibration_table
+    from trueflight.groundstation.report.calibration import write_calibration
+    from trueflight.groundstation.study.calibration_study import (
+        Study,
+        forget_diagnoses,
+        hideable,
+        run,
+        sorties,
+    )
 
     if not 40.0 <= seconds <= 1800.0:
         raise InputError(
@@ -124,7 +130,7 @@ def print_calibration(result: Calibration, folder: Path) -> None:
     """The study in a terminal of 100 columns."""
     from rich.table import Table
 
-    from groundstation.evaluate.calibration import NOTHING, OUTCOMES
+    from trueflight.groundstation.evaluate.calibration import NOTHING, OUTCOMES
 
     told = f"{result.flights} flights"
     if result.not_flown:

@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from groundstation.commands.pilot import (
+from trueflight.groundstation.commands.pilot import (
     CfgOption,
     ConfigOption,
     ConnectOption,
@@ -27,11 +27,11 @@ from groundstation.commands.pilot import (
     link_settings,
     warn,
 )
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
-    from groundstation.operate.link import Link
-    from models.database import Collection, Sortie
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.models.database import Collection, Sortie
 
 console = Console()
 
@@ -73,8 +73,8 @@ def collect_command(
     low); the same command continues with the flights that are missing, on another battery for instance.
     """
     check_controller(controller)
-    from groundstation.operate.link import Link
-    from models.database import Collection, database, record_name
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.models.database import Collection, database, record_name
 
     sorties = {
         record_name(number, sortie): sortie for number, sortie in enumerate(database(seed, minutes), 1)

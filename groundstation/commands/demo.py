@@ -18,15 +18,15 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from groundstation.evaluate.compare import compare, waterfall
-from groundstation.evaluate.tracking import Tracking, track_file
-from groundstation.evaluate.where import where_it_fails
-from groundstation.identify.actuation import actuation_of
-from groundstation.identify.translation import diagnose
-from groundstation.operate.link import Link
-from groundstation.operate.processes import program, running_rig
-from groundstation.operate.settings import Settings
-from groundstation.output.tables import (
+from trueflight.groundstation.evaluate.compare import compare, waterfall
+from trueflight.groundstation.evaluate.tracking import Tracking, track_file
+from trueflight.groundstation.evaluate.where import where_it_fails
+from trueflight.groundstation.identify.actuation import actuation_of
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.operate.link import Link
+from trueflight.groundstation.operate.processes import program, running_rig
+from trueflight.groundstation.operate.settings import Settings
+from trueflight.groundstation.output.tables import (
     SAID,
     percent,
     print_comparisons,
@@ -34,15 +34,15 @@ from groundstation.output.tables import (
     print_waterfall,
     print_where,
 )
-from groundstation.reading import read_flight
-from groundstation.results import Comparison, Diagnosis
-from groundstation.versions.store import add_effect, lineage, save
-from models.errors import InputError
-from models.export import export_onnx, not_exported
-from models.flight import Flight
-from models.model import Model, rigid_body_model
-from models.vehicle import Vehicle, load_vehicle
-from models.whole_file import write_whole
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.results import Comparison, Diagnosis
+from trueflight.groundstation.versions.store import add_effect, lineage, save
+from trueflight.models.errors import InputError
+from trueflight.models.export import export_onnx, not_exported
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model, rigid_body_model
+from trueflight.models.vehicle import Vehicle, load_vehicle
+from trueflight.models.whole_file import write_whole
 
 VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
 SURVEY: tuple[str, dict[str, float]] = ("excitation", {})
@@ -151,10 +151,10 @@ def _analyse(
     console: Console, folder: Path, vehicle: Vehicle, survey: Path, task: Path
 ) -> tuple[Model, Diagnosis, Comparison, Comparison, tuple[Path, ...]]:
     """Compare, see where, diagnose, add what is missing. Returns the last model and what was measured."""
-    from groundstation.evaluate.analysis import analyse
-    from groundstation.output.as_json import analysis_table
-    from groundstation.report import render, write_report
-    from groundstation.views import write_analysis, write_before_after
+    from trueflight.groundstation.evaluate.analysis import analyse
+    from trueflight.groundstation.output.as_json import analysis_table
+    from trueflight.groundstation.report import render, write_report
+    from trueflight.groundstation.views import write_analysis, write_before_after
 
     fitted, held_out = read_flight(survey), read_flight(task)
     base = rigid_body_model(vehicle)
@@ -223,7 +223,7 @@ def _reveal(sealed: Path, hidden: Sequence[str]) -> str:
 
 
 def _tracking_recording(folder: Path, tracking: tuple[Tracking, Tracking]) -> tuple[Path, ...]:
-    from groundstation.views import write_tracking
+    from trueflight.groundstation.views import write_tracking
 
     path = folder / "tracking.rrd"
     write_tracking(path, tracking)

@@ -19,7 +19,7 @@ TEMPLATE = '''"""NAME: say in one line what it does to the vehicle."""
 
 from array_api_compat import array_namespace
 
-from models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
 
 
 def formula(motion: Motion, *, pull: Array) -> Motion:
@@ -88,6 +88,6 @@ def effect_new(
 
 def write_template(name: str, folder: Path) -> Path:
     """Write the template of effect `name` into `folder`; raises as `write_effect_file`."""
-    from groundstation.versions.effect_file import write_effect_file
+    from trueflight.groundstation.versions.effect_file import write_effect_file
 
     return write_effect_file(name, TEMPLATE.replace("NAME", name), folder)

@@ -13,14 +13,14 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from models.errors import InputError
-from models.outside import toml_table
+from trueflight.models.errors import InputError
+from trueflight.models.outside import toml_table
 
 if TYPE_CHECKING:
-    from groundstation.design.linear_design import Loop
-    from groundstation.evaluate.tracking import Tracking
-    from groundstation.versions.vehicle_draft import Draft
-    from models.flight import Flight
+    from trueflight.groundstation.design.linear_design import Loop
+    from trueflight.groundstation.evaluate.tracking import Tracking
+    from trueflight.groundstation.versions.vehicle_draft import Draft
+    from trueflight.models.flight import Flight
 
 console = Console()
 
@@ -55,8 +55,8 @@ def flights_command(
     """The flights in a folder: what was flown, how long, and what was measured."""
     from rich.progress import track as progress
 
-    from groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
-    from models.whole_file import is_hidden
+    from trueflight.groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
+    from trueflight.models.whole_file import is_hidden
 
     if not directory.is_dir():
         raise InputError(f"{directory}: no such folder; pass the one that holds your flights")
@@ -125,8 +125,8 @@ SHORT = {
 
 def _flight_row(file: Path, directory: Path) -> dict[str, Any]:
     """What the table tells of one file; a file that cannot be read tells why."""
-    from groundstation.reading import read_flight
-    from groundstation.reading.ros_bag import is_ros_bag
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.ros_bag import is_ros_bag
 
     stamp = datetime.fromtimestamp(file.stat().st_mtime, UTC)
     row: dict[str, Any] = {
@@ -156,7 +156,7 @@ def _flight_row(file: Path, directory: Path) -> dict[str, Any]:
 
 
 def _record_facts(file: Path) -> dict[str, Any]:
-    from models.record import read_record
+    from trueflight.models.record import read_record
 
     record = read_record(file)
     facts = {name: record.metadata.get(name, "") for name in ("trajectory", "controller", "model")}
@@ -182,8 +182,8 @@ def import_command(
 
     From a PX4 ULog a vehicle file can be drafted first: `--draft-vehicle vehicle.toml`, with or without `-o`.
     """
-    from groundstation.reading import read_flight
-    from groundstation.reading.writing import own_table, write_flight
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.writing import own_table, write_flight
 
     if output is None and draft is None:
         raise InputError("import: say where to write the flight with -o FILE.csv, or draft its vehicle file")
@@ -215,7 +215,7 @@ def import_command(
                 "notes": list(flight.notes),
             }
     if drafted is not None and draft is not None:
-        from groundstation.versions.vehicle_draft import write_draft
+        from trueflight.groundstation.versions.vehicle_draft import write_draft
 
         write_draft(drafted, draft)
         told |= {
@@ -239,10 +239,10 @@ def import_command(
 
 def _drafted(file: Path, target: Path, mass: float | None) -> Draft:
     """The vehicle file drafted from a PX4 log, not yet written."""
-    from groundstation.reading.flight_file import ULOGS
-    from groundstation.reading.px4_log import load_ulog
-    from groundstation.versions.vehicle_draft import draft_vehicle
-    from models.outside import unreadable
+    from trueflight.groundstation.reading.flight_file import ULOGS
+    from trueflight.groundstation.reading.px4_log import load_ulog
+    from trueflight.groundstation.versions.vehicle_draft import draft_vehicle
+    from trueflight.models.outside import unreadable
 
     if file.suffix.lower() not in ULOGS:
         raise InputError(f"{file}: only a PX4 ULog holds the parameters that a vehicle file is drafted from")
@@ -287,16 +287,16 @@ def design_command(
     as_json: JsonOption = False,
 ) -> None:
     """Gains of the linear cascade by LQR, with and without integral, and what the closed loop will do."""
-    from groundstation.design.integral_design import integral_loops, with_integral
-    from groundstation.design.linear_design import (
+    from trueflight.groundstation.design.integral_design import integral_loops, with_integral
+    from trueflight.groundstation.design.linear_design import (
         ATTITUDE_BANDWIDTH,
         POSITION_BANDWIDTH,
         actuation,
         loops,
         make_design,
     )
-    from models.design import load_design, save_design
-    from models.vehicle import load_vehicle
+    from trueflight.models.design import load_design, save_design
+    from trueflight.models.vehicle import load_vehicle
 
     believed = load_vehicle(vehicle)
     if keep is not None:
@@ -413,11 +413,11 @@ def track_command(
     as_json: JsonOption = False,
 ) -> None:
     """Flights against the linear behaviour expected of them: mean squared error per axis, as in the paper."""
-    from groundstation.evaluate.tracking import told_apart, track_file
+    from trueflight.groundstation.evaluate.tracking import told_apart, track_file
 
     tracked = told_apart([track_file(path, design, vehicle) for path in flights])
     if rrd is not None:
-        from groundstation.views import write_tracking
+        from trueflight.groundstation.views import write_tracking
 
         write_tracking(rrd, tracked)
     if as_json:

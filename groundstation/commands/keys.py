@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from models.access import ENGINEER, OBSERVER, OPERATOR
+from trueflight.models.access import ENGINEER, OBSERVER, OPERATOR
 
 console = Console()
 
@@ -45,7 +45,7 @@ def keys_command(
     Every option may be repeated. Prints what to copy where. FOLDER/ca is what makes new keys: keep it on this machine,
     and a copy of it where it is safe.
     """
-    from groundstation.operate.keys import make_keys, next_steps
+    from trueflight.groundstation.operate.keys import make_keys, next_steps
 
     people = [
         (name, role)

@@ -13,13 +13,13 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from models.contract import CONTROLLERS, too_large
-from models.errors import InputError
+from trueflight.models.contract import CONTROLLERS, too_large
+from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
-    from groundstation.operate.link import Link
-    from groundstation.operate.settings import Settings
-    from models.record_pb2 import Event
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.settings import Settings
+    from trueflight.models.record_pb2 import Event
 
 console = Console()
 
@@ -77,7 +77,7 @@ def link_settings(
     keys: Path | None = None,
 ) -> Settings:
     """The settings of a link: those of the file, overridden by the options given."""
-    from groundstation.operate.settings import load_settings
+    from trueflight.groundstation.operate.settings import load_settings
 
     given: dict[str, Any] = {
         "name": name,
@@ -142,7 +142,7 @@ def fly_command(
     if reason:
         raise InputError(f"{trajectory}: {reason}; split the file")
     settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)
-    from groundstation.operate.link import Link
+    from trueflight.groundstation.operate.link import Link
 
     with Link(settings) as link:
         warn(link)
@@ -182,8 +182,8 @@ def fly_command(
 
 def _mission(trajectory: str, parameters: list[str], repeat: int) -> dict[str, Any]:
     """The mission's trajectory, checked here so that a typing error needs no vehicle."""
-    from models.reference import check_duration, trajectory_from_csv
-    from models.reference import trajectory as named
+    from trueflight.models.reference import check_duration, trajectory_from_csv
+    from trueflight.models.reference import trajectory as named
 
     if trajectory.lower().endswith(".csv"):
         try:
@@ -213,7 +213,7 @@ def _mission(trajectory: str, parameters: list[str], repeat: int) -> dict[str, A
 
 
 def _list_trajectories(as_json: bool) -> None:
-    from models.reference import KINDS
+    from trueflight.models.reference import KINDS
 
     if as_json:
         typer.echo(
@@ -326,7 +326,7 @@ def deploy_command(
     before the mission begins. A model that has proved itself before is live at once. With --roll-back a model in the
     shadow, or one that waits for it, is withdrawn; without one, the previous model becomes live again.
     """
-    from groundstation.operate.link import Link
+    from trueflight.groundstation.operate.link import Link
 
     if roll_back and (model is not None or shadow is not None):
         raise InputError("--roll-back goes back to the previous model; leave the file and --shadow out")
@@ -363,7 +363,7 @@ def deploy_command(
 
 
 def _hash(onnx: bytes) -> str:
-    from models.contract import model_hash
+    from trueflight.models.contract import model_hash
 
     return model_hash(onnx)
 
@@ -468,7 +468,7 @@ def status_command(
     as_json: JsonOption = False,
 ) -> None:
     """What the companion is doing, and whether it could fly now."""
-    from groundstation.operate.link import Link
+    from trueflight.groundstation.operate.link import Link
 
     with Link(link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)) as link:
         status = link.status()
@@ -540,8 +540,8 @@ def monitor_command(
     keys: KeysOption = None,
 ) -> None:
     """Watch a vehicle live in Rerun: path, reference, commands, correction, guard, latency."""
-    from groundstation.operate.link import Link
-    from groundstation.views import monitor
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.views import monitor
 
     with Link(link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)) as link:
         warn(link)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from groundstation.commands.analysis import (
+from trueflight.groundstation.commands.analysis import (
     DEFAULT_STORE,
     EffectsOption,
     JsonOption,
@@ -20,13 +20,13 @@ from groundstation.commands.analysis import (
     VehicleOption,
     print_json,
 )
-from models.errors import InputError
-from models.whole_file import write_whole
+from trueflight.models.errors import InputError
+from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from groundstation.identify.planning import FlightPlan
-    from models.design import Design
-    from models.vehicle import Vehicle
+    from trueflight.groundstation.identify.planning import FlightPlan
+    from trueflight.models.design import Design
+    from trueflight.models.vehicle import Vehicle
 
 console = Console()
 
@@ -71,12 +71,12 @@ def plan_command(
 
     The file is flown like any table of setpoints: `groundstation fly plan.csv`, `sim-bridge fly --trajectory plan.csv`.
     """
-    from groundstation.commands.remainder import base_for_diagnosis
-    from groundstation.identify.planning import Limits, plan_flight, setpoints
-    from groundstation.identify.translation import diagnose
-    from groundstation.output.as_json import plain
-    from groundstation.reading import read_flight
-    from models.vehicle import load_vehicle
+    from trueflight.groundstation.commands.remainder import base_for_diagnosis
+    from trueflight.groundstation.identify.planning import Limits, plan_flight, setpoints
+    from trueflight.groundstation.identify.translation import diagnose
+    from trueflight.groundstation.output.as_json import plain
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.models.vehicle import load_vehicle
 
     limits = Limits(radius, low, high, speed, acceleration, duration)
     directory = None if effects is None else str(effects)
@@ -118,8 +118,8 @@ def plan_command(
 
 def _design(given: Path | None, vehicle: Vehicle, flight: Path | None) -> Design:
     """The design that will fly: the one given, the record's own, or the one beside the vehicle file."""
-    from models.design import load_design
-    from models.record import read_record
+    from trueflight.models.design import load_design
+    from trueflight.models.record import read_record
 
     if given is not None:
         return load_design(given, vehicle)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from groundstation.commands.analysis import (
+from trueflight.groundstation.commands.analysis import (
     DEFAULT_STORE,
     BandwidthOption,
     EffectsOption,
@@ -22,12 +22,12 @@ from groundstation.commands.analysis import (
     chosen_model,
     print_json,
 )
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
-    from groundstation.results import Diagnosis, Unexplained
-    from models.flight import Flight
-    from models.model import Model
+    from trueflight.groundstation.results import Diagnosis, Unexplained
+    from trueflight.models.flight import Flight
+    from trueflight.models.model import Model
 
 console = Console()
 
@@ -41,7 +41,7 @@ def register(app: typer.Typer) -> None:
 
 def base_for_diagnosis(which: str | None, flight: Flight, store: Path, effects: Path | None) -> Model:
     """The model asked for, as one that a diagnosis can start from: with exact rotation."""
-    from models.model import rigid_body_model
+    from trueflight.models.model import rigid_body_model
 
     base = chosen_model(which, flight, store, effects)
     if "rigid_body" in base.names():
@@ -72,11 +72,11 @@ def remainder_command(
 
     `--write` makes the formula an effect: `groundstation model add NAME --effects DIR` takes it.
     """
-    from groundstation.identify.sparse import effect_source
-    from groundstation.identify.translation import diagnose
-    from groundstation.output.as_json import plain
-    from groundstation.reading import read_flight
-    from groundstation.versions.effect_file import write_effect_file
+    from trueflight.groundstation.identify.sparse import effect_source
+    from trueflight.groundstation.identify.translation import diagnose
+    from trueflight.groundstation.output.as_json import plain
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.versions.effect_file import write_effect_file
 
     read = read_flight(flight, vehicle, mapping)
     base = base_for_diagnosis(model, read, store, effects)
@@ -112,8 +112,8 @@ def _table(d: Diagnosis, path: Path | None) -> dict[str, Any]:
 def _print(left: Unexplained, d: Diagnosis, path: Path | None, flight: Path) -> None:
     from rich.table import Table
 
-    from groundstation.identify.sparse import written
-    from groundstation.output.tables import percent
+    from trueflight.groundstation.identify.sparse import written
+    from trueflight.groundstation.output.tables import percent
 
     console.print(
         f"{d.flight.name}: explained by {', '.join(d.model.names())}; left are {d.rms_after:.3f} m/s² "

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from groundstation.commands.analysis import (
+from trueflight.groundstation.commands.analysis import (
     DEFAULT_STORE,
     BandwidthOption,
     EffectsOption,
@@ -70,12 +70,12 @@ def report_command(
     last of them, and all are compared side by side. Sections: ranking, waterfall, prediction, where, worst, tracking,
     side_by_side, blind, provenance.
     """
-    from groundstation.evaluate.analysis import analyse
-    from groundstation.evaluate.side_by_side import side_by_side, told_apart
-    from groundstation.output.as_json import analysis_table
-    from groundstation.output.tables import print_diagnosis
-    from groundstation.reading import read_flight
-    from groundstation.report import chosen, render, write_report
+    from trueflight.groundstation.evaluate.analysis import analyse
+    from trueflight.groundstation.evaluate.side_by_side import side_by_side, told_apart
+    from trueflight.groundstation.output.as_json import analysis_table
+    from trueflight.groundstation.output.tables import print_diagnosis
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.report import chosen, render, write_report
 
     sections = chosen(without or ())
     read = read_flight(flight, vehicle, mapping)
@@ -94,7 +94,7 @@ def report_command(
         table = analysis_table(whole)
         write_report(output, render(whole, table, sections))
         if save is not None:
-            from groundstation.views import write_analysis
+            from trueflight.groundstation.views import write_analysis
 
             write_analysis(save, whole)
     if as_json:

@@ -15,13 +15,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from groundstation.commands.analysis import print_json
-from models.errors import InputError
-from models.outside import read_text
-from models.whole_file import write_whole
+from trueflight.groundstation.commands.analysis import print_json
+from trueflight.models.errors import InputError
+from trueflight.models.outside import read_text
+from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from groundstation.study.reproduce import Prepared, Scenario, Study
+    from trueflight.groundstation.study.reproduce import Prepared, Scenario, Study
 
 console = Console()
 
@@ -70,7 +70,7 @@ def reproduce_command(
     Each seed is another vehicle: the simulator draws what is hidden in it. MSE per axis is against the expected
     linear behaviour; each figure is the median over the seeds, with the least and the greatest.
     """
-    from groundstation.study import reproduce as r
+    from trueflight.groundstation.study import reproduce as r
 
     chosen = _scenarios(scenario, r.SCENARIOS)
     truth = [word for name in (hidden or ["rich"]) for word in ("--hidden", name)]
@@ -150,8 +150,8 @@ def _bar(quiet: bool) -> Progress:
 def _save(path: Path, folder: Path, scenario: Scenario) -> None:
     from dataclasses import replace
 
-    from groundstation.evaluate.tracking import track_file
-    from groundstation.views import write_tracking
+    from trueflight.groundstation.evaluate.tracking import track_file
+    from trueflight.groundstation.views import write_tracking
 
     names = {"lqr": "lqr", "lqr-+-integral": "lqr_integral", "effects-+-network": "corrected"}
     tracked = [
@@ -162,7 +162,7 @@ def _save(path: Path, folder: Path, scenario: Scenario) -> None:
 
 
 def _print(study: Study, scenarios: Sequence[Scenario], companion: bool) -> None:
-    from groundstation.study.reproduce import ANATOMY, ARMS, BOTH, PAPER
+    from trueflight.groundstation.study.reproduce import ANATOMY, ARMS, BOTH, PAPER
 
     for prepared in study.prepared:
         _print_prepared(prepared)
@@ -262,7 +262,7 @@ def _ratio(before: np.ndarray, after: np.ndarray) -> str:
 
 
 def _table(study: Study, scenarios: Sequence[Scenario]) -> dict[str, Any]:
-    from groundstation.study.reproduce import PAPER
+    from trueflight.groundstation.study.reproduce import PAPER
 
     cells: dict[str, dict[str, dict[str, Any]]] = {}
     for f in study.flown:

@@ -13,18 +13,18 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from groundstation.commands.analysis import (
+from trueflight.groundstation.commands.analysis import (
     EffectsOption,
     JsonOption,
     MappingOption,
     VehicleOption,
     print_json,
 )
-from models.errors import InputError
-from models.whole_file import write_whole
+from trueflight.models.errors import InputError
+from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from groundstation.evaluate.survey import Fleet, Row
+    from trueflight.groundstation.evaluate.survey import Fleet, Row
 
 console = Console()
 SHOWN = 40
@@ -61,8 +61,8 @@ def survey_command(
     A file that cannot be used is told and skipped. `--save` writes survey.jsonl (one line a flight, as they are done),
     survey.parquet and fleet.json.
     """
-    from groundstation.evaluate.survey import fleet_of, flight_files, row_table, stamp_of, survey
-    from groundstation.output.as_json import plain
+    from trueflight.groundstation.evaluate.survey import fleet_of, flight_files, row_table, stamp_of, survey
+    from trueflight.groundstation.output.as_json import plain
 
     files = flight_files(folder)
     known = [] if save is None else _already(save, files)
@@ -90,7 +90,7 @@ def survey_command(
 
 def _already(save: Path, files: Sequence[Path]) -> list[Row]:
     """Rows of an earlier run on the same files."""
-    from groundstation.evaluate.survey import row_from_table, stamp_of
+    from trueflight.groundstation.evaluate.survey import row_from_table, stamp_of
 
     path = save / "survey.jsonl"
     if not path.is_file():
@@ -129,8 +129,8 @@ def _kept(save: Path | None, new: bool) -> Iterator[Callable[[str], None]]:
 
 
 def _write(save: Path, rows: Iterable[Row], fleet: Fleet) -> None:
-    from groundstation.evaluate.survey import SAVED_TABLE, write_table
-    from groundstation.output.as_json import plain
+    from trueflight.groundstation.evaluate.survey import SAVED_TABLE, write_table
+    from trueflight.groundstation.output.as_json import plain
 
     write_table(list(rows), save / SAVED_TABLE)
     text = json.dumps(plain(asdict(fleet)), indent=1, allow_nan=False)
@@ -174,7 +174,7 @@ def print_survey(rows: Sequence[Row], fleet: Fleet, folder: Path) -> None:
     """Flights, effects and parameters, in a terminal of 100 columns."""
     from rich.table import Table
 
-    from groundstation.output.tables import percent
+    from trueflight.groundstation.output.tables import percent
 
     root = folder.resolve()
     table = Table(title=f"{folder}: {len(rows)} flights", title_justify="left")

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from groundstation.commands.analysis import (
+from trueflight.groundstation.commands.analysis import (
     DEFAULT_STORE,
     BandwidthOption,
     EffectsOption,
@@ -24,14 +24,14 @@ from groundstation.commands.analysis import (
     chosen_model,
     print_json,
 )
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
-    from groundstation.learn.ablation import Ablation
-    from groundstation.learn.training import Epoch, Training
-    from groundstation.learn.training_data import Samples
-    from models.flight import Flight
-    from models.model import Model
+    from trueflight.groundstation.learn.ablation import Ablation
+    from trueflight.groundstation.learn.training import Epoch, Training
+    from trueflight.groundstation.learn.training_data import Samples
+    from trueflight.models.flight import Flight
+    from trueflight.models.model import Model
 
 console = Console()
 
@@ -81,9 +81,9 @@ def train_command(
     The network learns what the linear model plus the effects of --model (default: the newest version, else
     exact rotation alone; `linear` as in the paper) do not explain of these flights.
     """
-    from groundstation.learn.training import memory_share, recipe_named, train, with_epochs
-    from groundstation.output.as_json import network_summary, plain
-    from groundstation.versions.store import save as save_version
+    from trueflight.groundstation.learn.training import memory_share, recipe_named, train, with_epochs
+    from trueflight.groundstation.output.as_json import network_summary, plain
+    from trueflight.groundstation.versions.store import save as save_version
 
     widths, chosen = _widths(layers), with_epochs(recipe_named(recipe), epochs)
     flights = read_flights(flight, vehicle, mapping, quiet=as_json)
@@ -106,7 +106,7 @@ def train_command(
     made, path = save_version(store, base.with_network(done.network), base if base.version else None)
     checkpoint.unlink(missing_ok=True)
     if save is not None:
-        from groundstation.views import write_training
+        from trueflight.groundstation.views import write_training
 
         write_training(save, done, samples, made.label)
     if as_json:
@@ -159,9 +159,9 @@ def ablate_command(
     """
     from dataclasses import asdict
 
-    from groundstation.learn.ablation import LEAST_IMPORTANT, ablate, architectures
-    from groundstation.learn.training import recipe_named, with_epochs
-    from groundstation.output.as_json import plain
+    from trueflight.groundstation.learn.ablation import LEAST_IMPORTANT, ablate, architectures
+    from trueflight.groundstation.learn.training import recipe_named, with_epochs
+    from trueflight.groundstation.output.as_json import plain
 
     tried = architectures(_numbers("--depths", depths, 7), _numbers("--widths", widths, 1024))
     chosen = with_epochs(recipe_named(recipe), epochs)
@@ -180,7 +180,7 @@ def ablate_command(
 
         result = ablate(samples, base, flights[0], chosen, seed, tried, features, progress)
     if save is not None:
-        from groundstation.views import write_ablation
+        from trueflight.groundstation.views import write_ablation
 
         write_ablation(save, result)
     if as_json:
@@ -203,7 +203,7 @@ def read_flights(
 
     Raises `InputError` for a folder without flights, and for whatever makes a file unfit.
     """
-    from groundstation.reading import read_flight
+    from trueflight.groundstation.reading import read_flight
 
     files = [file for path in paths for file in (_flights_in(path) if path.is_dir() else [path])]
     flights = []
@@ -216,8 +216,8 @@ def read_flights(
 
 
 def _flights_in(folder: Path) -> list[Path]:
-    from groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
-    from models.whole_file import is_hidden
+    from trueflight.groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
+    from trueflight.models.whole_file import is_hidden
 
     endings = (*RECORDS, *TABLES, *ULOGS)
     found: dict[Path, Path] = {}
@@ -241,7 +241,7 @@ def _base(which: str | None, flights: list[Flight], store: Path, effects: Path |
 
 
 def _samples(flights: list[Flight], base: Model, bandwidth: float | None, quiet: bool) -> Samples:
-    from groundstation.learn.training_data import samples_of_flights
+    from trueflight.groundstation.learn.training_data import samples_of_flights
 
     with nullcontext() if quiet else _bar("measuring the remainder", len(flights)) as show:
         count = 0
@@ -290,7 +290,7 @@ def _bar(what: str, total: int) -> Iterator[Callable[[int, str], None]]:
 def _print_training(done: Training, samples: Samples, base: Model) -> None:
     from rich.table import Table
 
-    from groundstation.learn.training import MATERIAL_MEMORY, memory_share
+    from trueflight.groundstation.learn.training import MATERIAL_MEMORY, memory_share
 
     network, fit = done.network, done.network.fit
     minutes = samples.seconds / 60.0

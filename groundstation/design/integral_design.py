@@ -18,7 +18,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from groundstation.design.linear_design import (
+from trueflight.groundstation.design.linear_design import (
     ACCELERATION,
     PHASE_MARGIN,
     Loop,
@@ -27,10 +27,10 @@ from groundstation.design.linear_design import (
     loops,
     wrapped_margin,
 )
-from models.design import Design, IntegralGains
-from models.errors import InputError
-from models.trajectory import min_jerk, transfer_time
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.models.design import Design, IntegralGains
+from trueflight.models.errors import InputError
+from trueflight.models.trajectory import min_jerk, transfer_time
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 REMOVAL = (2.0, 3.0, 4.0, 6.0, 8.0)
 """Settling times of the position loop within which a constant disturbance must be gone: the first that the phase

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.design import Design, hover_input_matrix
-from models.errors import InputError
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.models.design import Design, hover_input_matrix
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 POSITION_BANDWIDTH = 0.35
 """Hz, natural frequency of the horizontal position loop: 2.2 rad/s, a step of 1 m settles in about 2 s."""

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.design import Design, hover_input_matrix
-from models.errors import InputError
-from models.frames import heading_from_world, wrap_angle
-from models.vehicle import GRAVITY
+from trueflight.models.design import Design, hover_input_matrix
+from trueflight.models.errors import InputError
+from trueflight.models.frames import heading_from_world, wrap_angle
+from trueflight.models.vehicle import GRAVITY
 
 
 @dataclass(frozen=True)

@@ -14,19 +14,19 @@ from pathlib import Path
 
 import numpy as np
 
-from groundstation.evaluate.compare import compare
-from groundstation.evaluate.side_by_side import SideBySide
-from groundstation.evaluate.tracking import Tracking, missions, track
-from groundstation.evaluate.where import where_it_fails
-from groundstation.identify.fitting import Problem, fit, model_of
-from groundstation.identify.translation import diagnose
-from groundstation.measured.measurement import measure
-from groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
-from models.design import Design
-from models.effects import effect_named
-from models.errors import InputError
-from models.flight import Flight
-from models.model import Model, Term, linear_model
+from trueflight.groundstation.evaluate.compare import compare
+from trueflight.groundstation.evaluate.side_by_side import SideBySide
+from trueflight.groundstation.evaluate.tracking import Tracking, missions, track
+from trueflight.groundstation.evaluate.where import where_it_fails
+from trueflight.groundstation.identify.fitting import Problem, fit, model_of
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.measured.measurement import measure
+from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
+from trueflight.models.design import Design
+from trueflight.models.effects import effect_named
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model, Term, linear_model
 
 LIBRARIES = ("trueflight", "numpy", "scipy", "statsmodels")
 """What the figures depend on, besides the data."""

@@ -35,13 +35,13 @@ from typing import Literal
 
 import numpy as np
 
-from groundstation.design.linear_response import Behaviour, Reference, expected_behaviour
-from groundstation.evaluate.tracking import missions, reference_of
-from models.design import Design, hover_input_matrix
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import euler_from_quaternion, rotate, world_from_heading
-from models.vehicle import GRAVITY
+from trueflight.groundstation.design.linear_response import Behaviour, Reference, expected_behaviour
+from trueflight.groundstation.evaluate.tracking import missions, reference_of
+from trueflight.models.design import Design, hover_input_matrix
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import euler_from_quaternion, rotate, world_from_heading
+from trueflight.models.vehicle import GRAVITY
 
 Around = Literal["design", "reference"]
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from groundstation.identify.fitting import with_clock
-from groundstation.measured.measurement import Measurement, measure
-from groundstation.results import AxisError, Comparison, HorizonError, WaterfallStep
-from models.effect import Motion
-from models.flight import Flight
-from models.frames import euler_from_quaternion, heading_from_world, world_from_heading
-from models.model import Model, linear_model
-from models.prediction import Chain, acceleration, act, motion_of_flight, specific_force
-from models.vehicle import GRAVITY
+from trueflight.groundstation.identify.fitting import with_clock
+from trueflight.groundstation.measured.measurement import Measurement, measure
+from trueflight.groundstation.results import AxisError, Comparison, HorizonError, WaterfallStep
+from trueflight.models.effect import Motion
+from trueflight.models.flight import Flight
+from trueflight.models.frames import euler_from_quaternion, heading_from_world, world_from_heading
+from trueflight.models.model import Model, linear_model
+from trueflight.models.prediction import Chain, acceleration, act, motion_of_flight, specific_force
+from trueflight.models.vehicle import GRAVITY
 
 HORIZONS = (0.1, 0.5, 1.0)
 """s after which the open-loop prediction is compared with the flight."""

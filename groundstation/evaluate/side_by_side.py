@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from groundstation.evaluate.compare import compare
-from groundstation.evaluate.where import common_bins, where_it_fails
-from groundstation.results import Comparison, WhereItFails
-from models.flight import Flight
-from models.model import Model
+from trueflight.groundstation.evaluate.compare import compare
+from trueflight.groundstation.evaluate.where import common_bins, where_it_fails
+from trueflight.groundstation.results import Comparison, WhereItFails
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from models.errors import InputError
-from models.outside import is_number
-from models.whole_file import is_hidden, whole_file
+from trueflight.models.errors import InputError
+from trueflight.models.outside import is_number
+from trueflight.models.whole_file import is_hidden, whole_file
 
 VERDICTS = ("missing", "possible", "not_supported", "not_excited", "included")
 
@@ -108,7 +108,7 @@ class Fleet:
 
 def flight_files(folder: Path) -> list[Path]:
     """Every flight file below `folder`; raises `InputError` where there is none."""
-    from groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
+    from trueflight.groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
 
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; pass the one that holds your flights")
@@ -128,9 +128,9 @@ SAVED_TABLE = "survey.parquet"
 
 def survey_flight(file: str, vehicle: str | None, mapping: str | None, effects: str | None) -> Row:
     """Diagnose one file from the linear model with exact rotation; whatever goes wrong is told in the row."""
-    from groundstation.identify.translation import diagnose
-    from groundstation.reading import read_flight
-    from models.model import rigid_body_model
+    from trueflight.groundstation.identify.translation import diagnose
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.models.model import rigid_body_model
 
     path, begin = Path(file), time.perf_counter()
     row = Row(file, stamp_of(path), _day(path))

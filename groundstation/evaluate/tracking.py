@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from groundstation.design.linear_response import Reference, expected_behaviour
-from groundstation.reading import read_flight, segments
-from models.design import Design, load_design
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import euler_from_quaternion, wrap_angle
+from trueflight.groundstation.design.linear_response import Reference, expected_behaviour
+from trueflight.groundstation.reading import read_flight, segments
+from trueflight.models.design import Design, load_design
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import euler_from_quaternion, wrap_angle
 
 SHORTEST = 2.0  # s
 
@@ -54,7 +54,7 @@ def read_designed(
     label = path.stem
     flight = read_flight(path, vehicle)
     if path.suffix.lower() == ".mcap":
-        from models.record import read_record
+        from trueflight.models.record import read_record
 
         record = read_record(path)
         controller = record.metadata.get("controller", "")

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from groundstation.results import Comparison, ErrorMap, Moment, PlaceMap, Region, WhereItFails
-from models.flight import Flight
-from models.frames import rotation_matrix
+from trueflight.groundstation.results import Comparison, ErrorMap, Moment, PlaceMap, Region, WhereItFails
+from trueflight.models.flight import Flight
+from trueflight.models.frames import rotation_matrix
 
 BINS = 16
 FINE = 40

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groundstation.reading import segments
-from models.contract import ACTUATION_LIMITS
-from models.flight import Flight
-from models.model import Model
-from models.vehicle import Vehicle
+from trueflight.groundstation.reading import segments
+from trueflight.models.contract import ACTUATION_LIMITS
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model
+from trueflight.models.vehicle import Vehicle
 
 BANDWIDTH = 3.0
 """Hz up to which the rate loop's model has to be right: more than twice the attitude loop's bandwidth."""
@@ -84,7 +84,7 @@ def rate_loop_sensitivity(flight: Flight, loop: RateLoop) -> tuple[np.ndarray, f
     from scipy import signal
     from statsmodels.stats.sandwich_covariance import S_hac_simple
 
-    from groundstation.identify.fitting import HAC_LAG, critical_value
+    from trueflight.groundstation.identify.fitting import HAC_LAG, critical_value
 
     bread, meat, seconds = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
     x = np.array([loop.lag, loop.delay, loop.integral])

@@ -18,12 +18,12 @@ import numpy as np
 from scipy import optimize, stats
 from statsmodels.stats.sandwich_covariance import S_hac_simple
 
-from groundstation.measured.measurement import Measurement
-from models.effect import Effect, Motion, Parameter, Stage
-from models.effects import effect_named
-from models.model import Model, Term
-from models.prediction import Chain, act, motion_of_flight, specific_force
-from models.vehicle import Vehicle
+from trueflight.groundstation.measured.measurement import Measurement
+from trueflight.models.effect import Effect, Motion, Parameter, Stage
+from trueflight.models.effects import effect_named
+from trueflight.models.model import Model, Term
+from trueflight.models.prediction import Chain, act, motion_of_flight, specific_force
+from trueflight.models.vehicle import Vehicle
 
 HAC_LAG = 2.0
 """s of Bartlett kernel: beyond the slowest correlation that a position-controlled quadrotor shows."""

@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from groundstation.design.linear_response import Reference, expected_behaviour
-from groundstation.identify.fitting import (
+from trueflight.groundstation.design.linear_response import Reference, expected_behaviour
+from trueflight.groundstation.identify.fitting import (
     BLOCK,
     HAC_LAG,
     SCALE,
@@ -31,20 +31,20 @@ from groundstation.identify.fitting import (
     free_parameters,
     long_run_variance,
 )
-from groundstation.identify.translation import STRONG_EVIDENCE
-from groundstation.measured.measurement import Measurement, measure
-from groundstation.results import Diagnosis
-from models.design import Design
-from models.effect import Effect
-from models.effects import catalogue, effect_named
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import rotate_inverse
-from models.model import Term
-from models.prediction import Chain
-from models.reference import trajectory
-from models.trajectory import Segment, Trajectory, Waypoint, hold, min_jerk, path
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.groundstation.identify.translation import STRONG_EVIDENCE
+from trueflight.groundstation.measured.measurement import Measurement, measure
+from trueflight.groundstation.results import Diagnosis
+from trueflight.models.design import Design
+from trueflight.models.effect import Effect
+from trueflight.models.effects import catalogue, effect_named
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import rotate_inverse
+from trueflight.models.model import Term
+from trueflight.models.prediction import Chain
+from trueflight.models.reference import trajectory
+from trueflight.models.trajectory import Segment, Trajectory, Waypoint, hold, min_jerk, path
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 RATE = 50.0
 """Hz at which manoeuvres are predicted."""

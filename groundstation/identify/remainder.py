@@ -17,14 +17,14 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
 
-from groundstation.identify.fitting import BLOCK
-from groundstation.identify.sparse import sparse_formula
-from groundstation.identify.spectrum import spectral_lines
-from groundstation.identify.surrogates import BURST, random_phases, random_signs
-from groundstation.measured.bins import bins
-from groundstation.measured.measurement import Measurement
-from groundstation.results import SparseFormula, Unexplained
-from models.frames import euler_from_quaternion, rotate_inverse
+from trueflight.groundstation.identify.fitting import BLOCK
+from trueflight.groundstation.identify.sparse import sparse_formula
+from trueflight.groundstation.identify.spectrum import spectral_lines
+from trueflight.groundstation.identify.surrogates import BURST, random_phases, random_signs
+from trueflight.groundstation.measured.bins import bins
+from trueflight.groundstation.measured.measurement import Measurement
+from trueflight.groundstation.results import SparseFormula, Unexplained
+from trueflight.models.frames import euler_from_quaternion, rotate_inverse
 
 SHARE = 0.05
 """Part of the remaining squared error that must be predictable on held-out blocks to be called structure."""

@@ -3,8 +3,8 @@
 The torque of the rotors over the inertia is compared with the gyroscope's derivative. What no vehicle file knows well
 is fitted beside every effect, so that it is not taken for one: a gain of the control torque about each axis (inertia,
 thrust and drag-torque constants), a shift in time of it, damping by the body's rates, the torque of edgewise flow on
-the rotors (flapping), and the rotors' spin-up about z. Effects are chosen as in `identify.translation`: given all others,
-on held-out blocks, with inference that holds under autocorrelated residuals.
+the rotors (flapping), and the rotors' spin-up about z. Effects are chosen as in `identify.translation`: given all
+others, on held-out blocks, with inference that holds under autocorrelated residuals.
 
 Body rates against their command (`rate_loop_lag`) need no rotor data and are judged on their own.
 """
@@ -18,8 +18,8 @@ from functools import cached_property
 import numpy as np
 from scipy import optimize, stats
 
-from groundstation.identify.actuation import fit_rate_loop, rate_loop_sensitivity
-from groundstation.identify.fitting import (
+from trueflight.groundstation.identify.actuation import fit_rate_loop, rate_loop_sensitivity
+from trueflight.groundstation.identify.fitting import (
     BLOCK,
     Fit,
     Free,
@@ -28,15 +28,15 @@ from groundstation.identify.fitting import (
     long_run_variance,
     robust_covariance,
 )
-from groundstation.measured.measurement import Rotation, measure_rotation
-from groundstation.results import EffectVerdict, ParameterEstimate, RotationalRms
-from models.effect import Effect, Motion, Parameter, Stage
-from models.effects import catalogue
-from models.flight import Flight
-from models.frames import rotate_inverse
-from models.lag import delayed, lagged
-from models.model import Term
-from models.prediction import act, derivative, motion_of_flight
+from trueflight.groundstation.measured.measurement import Rotation, measure_rotation
+from trueflight.groundstation.results import EffectVerdict, ParameterEstimate, RotationalRms
+from trueflight.models.effect import Effect, Motion, Parameter, Stage
+from trueflight.models.effects import catalogue
+from trueflight.models.flight import Flight
+from trueflight.models.frames import rotate_inverse
+from trueflight.models.lag import delayed, lagged
+from trueflight.models.model import Term
+from trueflight.models.prediction import act, derivative, motion_of_flight
 
 FAMILY = 0.01
 """Probability that any rotational effect at all is significant by chance."""

@@ -13,11 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from groundstation.identify.fitting import HAC_LAG, UNMODELLED, Problem
-from models.effect import Effect
-from models.errors import InputError
-from models.flight import Flight
-from models.prediction import act, motion_of_flight
+from trueflight.groundstation.identify.fitting import HAC_LAG, UNMODELLED, Problem
+from trueflight.models.effect import Effect
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.prediction import act, motion_of_flight
 
 PATH = ("motor_lag", "transport_delay", "thrust_curve", "battery_sag")
 """Effects that may act between command and rotor speed."""

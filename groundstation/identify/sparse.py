@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from groundstation.identify.fitting import BLOCK
-from groundstation.identify.surrogates import BURST, random_phases, random_signs
-from groundstation.measured.bins import bins
-from groundstation.measured.measurement import Measurement
-from groundstation.results import FormulaTerm, SparseFormula
-from models.effect import Motion
-from models.prediction import motion_of_flight
+from trueflight.groundstation.identify.fitting import BLOCK
+from trueflight.groundstation.identify.surrogates import BURST, random_phases, random_signs
+from trueflight.groundstation.measured.bins import bins
+from trueflight.groundstation.measured.measurement import Measurement
+from trueflight.groundstation.results import FormulaTerm, SparseFormula
+from trueflight.models.effect import Motion
+from trueflight.models.prediction import motion_of_flight
 
 ALPHA = 0.01
 """Probability that any term at all is taken from a residual without structure."""
@@ -264,7 +264,7 @@ def effect_source(formula: SparseFormula, name: str, flight: str, data_hash: str
 
 from array_api_compat import array_namespace
 
-from models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
 
 
 def formula(motion: Motion, *, {", ".join(f"{c}: Array" for c in names)}) -> Motion:

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage, signal, stats
 
-from groundstation.measured.measurement import Measurement
-from groundstation.results import SpectralLine
+from trueflight.groundstation.measured.measurement import Measurement
+from trueflight.groundstation.results import SpectralLine
 
 FAMILY = 0.01
 """Probability that noise shows any line at all."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from groundstation.identify.fitting import (
+from trueflight.groundstation.identify.fitting import (
     Fit,
     Problem,
     block_errors,
@@ -26,16 +26,16 @@ from groundstation.identify.fitting import (
     robust_covariance,
     with_clock,
 )
-from groundstation.identify.remainder import unexplained
-from groundstation.identify.rotation import RotationalFindings, judge_rates, judge_rotation
-from groundstation.identify.rotors import BESIDE, PATH, RotorProblem, has_rotor_speeds
-from groundstation.measured.measurement import Measurement, measure
-from groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
-from models.effect import Effect, Parameter, Stage
-from models.effects import catalogue, effect_named
-from models.errors import InputError
-from models.flight import Flight
-from models.model import Model, Term
+from trueflight.groundstation.identify.remainder import unexplained
+from trueflight.groundstation.identify.rotation import RotationalFindings, judge_rates, judge_rotation
+from trueflight.groundstation.identify.rotors import BESIDE, PATH, RotorProblem, has_rotor_speeds
+from trueflight.groundstation.measured.measurement import Measurement, measure
+from trueflight.groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
+from trueflight.models.effect import Effect, Parameter, Stage
+from trueflight.models.effects import catalogue, effect_named
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model, Term
 
 FAMILY = 0.01
 """Probability that any effect at all is significant by chance, shared by all candidates (Bonferroni)."""

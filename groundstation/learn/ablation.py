@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import onnxruntime
 
-from groundstation.learn.training import Recipe, train
-from groundstation.learn.training_data import Samples
-from models import contract
-from models.export import export_onnx
-from models.flight import Flight
-from models.model import Model
-from models.network import Network, error_acceleration_of
+from trueflight.groundstation.learn.training import Recipe, train
+from trueflight.groundstation.learn.training_data import Samples
+from trueflight.models import contract
+from trueflight.models.export import export_onnx
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model
+from trueflight.models.network import Network, error_acceleration_of
 
 DEPTHS = (1, 2, 3)
 WIDTHS = (8, 16, 32, 64, 128)

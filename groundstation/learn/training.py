@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from groundstation.learn.training_data import Samples, split
-from models.contract import FEATURES, YAW_FEATURES
-from models.errors import InputError
-from models.export import sequential
-from models.network import Network, error_acceleration_of
-from models.outside import unreadable
-from models.whole_file import write_whole
+from trueflight.groundstation.learn.training_data import Samples, split
+from trueflight.models.contract import FEATURES, YAW_FEATURES
+from trueflight.models.errors import InputError
+from trueflight.models.export import sequential
+from trueflight.models.network import Network, error_acceleration_of
+from trueflight.models.outside import unreadable
+from trueflight.models.whole_file import write_whole
 
 WIDTHS = (64, 64)
 """Hidden layers of the paper."""

@@ -14,17 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from groundstation.evaluate.compare import heading_acceleration, heading_noise
-from groundstation.identify.fitting import with_clock
-from groundstation.measured.measurement import measure
-from models.contract import FEATURES, YAW_FEATURES
-from models.effect import Stage
-from models.errors import InputError
-from models.features import feature_names
-from models.flight import Flight
-from models.model import Model
-from models.network import features_of_motion
-from models.prediction import act, motion_of_flight, specific_force
+from trueflight.groundstation.evaluate.compare import heading_acceleration, heading_noise
+from trueflight.groundstation.identify.fitting import with_clock
+from trueflight.groundstation.measured.measurement import measure
+from trueflight.models.contract import FEATURES, YAW_FEATURES
+from trueflight.models.effect import Stage
+from trueflight.models.errors import InputError
+from trueflight.models.features import feature_names
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model
+from trueflight.models.network import features_of_motion
+from trueflight.models.prediction import act, motion_of_flight, specific_force
 
 VALIDATION_SHARE = 1.0 / 3.0
 """Of the samples, as in the paper."""

@@ -10,11 +10,11 @@ from functools import cache
 import numpy as np
 from scipy import ndimage, signal
 
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import rotate, rotate_inverse
-from models.prediction import derivative
-from models.vehicle import GRAVITY
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import rotate, rotate_inverse
+from trueflight.models.prediction import derivative
+from trueflight.models.vehicle import GRAVITY
 
 ACCELEROMETER_BANDWIDTH = 20.0
 """Hz. Thrust and drag of a quadrotor live below it, most of the rotors' vibration above."""

@@ -25,8 +25,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from models import access
-from models.errors import InputError
+from trueflight.models import access
+from trueflight.models.errors import InputError
 
 DAYS = 365
 """Days that the certificates of vehicles and people hold."""

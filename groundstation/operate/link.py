@@ -20,12 +20,12 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from groundstation.operate.settings import Settings
-from models.access import NEEDS, SIGNING_KEY, VEHICLE, Keys, read_keys, transport
-from models.contract import key
-from models.errors import InputError
-from models.record_pb2 import Event, Tick
-from models.session import (
+from trueflight.groundstation.operate.settings import Settings
+from trueflight.models.access import NEEDS, SIGNING_KEY, VEHICLE, Keys, read_keys, transport
+from trueflight.models.contract import key
+from trueflight.models.errors import InputError
+from trueflight.models.record_pb2 import Event, Tick
+from trueflight.models.session import (
     CONNECT,
     ENCRYPTED,
     LISTEN,
@@ -37,8 +37,8 @@ from models.session import (
     protocol,
     short,
 )
-from models.signature import sign
-from models.whole_file import whole_file
+from trueflight.models.signature import sign
+from trueflight.models.whole_file import whole_file
 
 PIECE_TRIES = 3
 ENDED = ("finished", "failed", "aborted")

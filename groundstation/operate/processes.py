@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 STARTING = 30.0
 """s that a process may take until it says ready."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from models.errors import InputError
-from models.outside import is_number, read_toml, shown
-from models.vehicle import check_name
+from trueflight.models.errors import InputError
+from trueflight.models.outside import is_number, read_toml, shown
+from trueflight.models.vehicle import check_name
 
 TEXTS = ("name", "mode", "zenoh_config", "flights", "keys")
 

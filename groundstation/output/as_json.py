@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
-from models.effects import effect_named
-from models.model import Model
-from models.network import Network
+from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
+from trueflight.models.effects import effect_named
+from trueflight.models.model import Model
+from trueflight.models.network import Network
 
 if TYPE_CHECKING:
-    from groundstation.evaluate.analysis import Analysis
-    from groundstation.evaluate.calibration import Calibration, Case
-    from groundstation.evaluate.side_by_side import SideBySide
-    from groundstation.evaluate.tracking import Tracking
+    from trueflight.groundstation.evaluate.analysis import Analysis
+    from trueflight.groundstation.evaluate.calibration import Calibration, Case
+    from trueflight.groundstation.evaluate.side_by_side import SideBySide
+    from trueflight.groundstation.evaluate.tracking import Tracking
 
 UNIT = "m/s^2"
 

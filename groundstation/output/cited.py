@@ -122,7 +122,7 @@ def _code(text: Told | str) -> Markup:
 def environment(html: bool) -> Environment:
     """Templates of the report, for HTML or for Markdown; whatever a template names must be there."""
     made = Environment(
-        loader=PackageLoader("groundstation.report"),
+        loader=PackageLoader("trueflight.groundstation.report"),
         autoescape=html,
         undefined=StrictUndefined,
         trim_blocks=True,

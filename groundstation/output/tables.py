@@ -9,8 +9,8 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from groundstation.evaluate.side_by_side import SideBySide
-from groundstation.results import Comparison, Diagnosis, EffectVerdict, WaterfallStep, WhereItFails
+from trueflight.groundstation.evaluate.side_by_side import SideBySide
+from trueflight.groundstation.results import Comparison, Diagnosis, EffectVerdict, WaterfallStep, WhereItFails
 
 VERDICT_STYLE = {
     "missing": "bold red",

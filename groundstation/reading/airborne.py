@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from groundstation.reading.uniform import segments
-from models.vehicle import Vehicle
+from trueflight.groundstation.reading.uniform import segments
+from trueflight.models.vehicle import Vehicle
 
 IDLE = 0.25  # of hover thrust
 DIP = 0.5  # s; a shorter loss of thrust is flown (a drop), not landed

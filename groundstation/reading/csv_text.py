@@ -7,8 +7,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from models.errors import InputError
-from models.outside import unreadable
+from trueflight.models.errors import InputError
+from trueflight.models.outside import unreadable
 
 MARKS = (
     (codecs.BOM_UTF8, "utf-8"),

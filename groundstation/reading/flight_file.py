@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from groundstation.reading import plausible
-from groundstation.reading.airborne import flying_mask
-from groundstation.reading.table import Table, own_columns, read_table, unknown_columns
-from groundstation.reading.uniform import MOST_LOST, even_clock
-from models.errors import InputError
-from models.flight import Flight
-from models.outside import unreadable
-from models.vehicle import Vehicle, load_vehicle
+from trueflight.groundstation.reading import plausible
+from trueflight.groundstation.reading.airborne import flying_mask
+from trueflight.groundstation.reading.table import Table, own_columns, read_table, unknown_columns
+from trueflight.groundstation.reading.uniform import MOST_LOST, even_clock
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.outside import unreadable
+from trueflight.models.vehicle import Vehicle, load_vehicle
 
 TABLES = (".csv", ".txt", ".tsv", ".parquet", ".pq")
 RECORDS = (".mcap",)
@@ -43,16 +43,16 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: str 
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the path (`groundstation flights DIR` lists flights)")
     if suffix in RECORDS:
-        from groundstation.reading.flight_record import read_flight_record
-        from groundstation.reading.px4_flight import flight_of
-        from groundstation.reading.ros_bag import is_ros_bag, load_ros_bag
+        from trueflight.groundstation.reading.flight_record import read_flight_record
+        from trueflight.groundstation.reading.px4_flight import flight_of
+        from trueflight.groundstation.reading.ros_bag import is_ros_bag, load_ros_bag
 
         if is_ros_bag(path):
             return flight_of(path, load_ros_bag(path), _vehicle(path, vehicle))
 
         return read_flight_record(path, vehicle)
     if suffix in ULOGS:
-        from groundstation.reading.ulog import read_ulog
+        from trueflight.groundstation.reading.ulog import read_ulog
 
         return read_ulog(path, _vehicle(path, vehicle))
     if suffix not in TABLES:
@@ -62,7 +62,7 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: str 
     believed = _vehicle(path, vehicle)
     mapping = mapping or _mapping_beside(path, table)
     if mapping is not None:
-        from groundstation.reading.mapping import apply_mapping, load_mapping
+        from trueflight.groundstation.reading.mapping import apply_mapping, load_mapping
 
         mapped = apply_mapping(table, load_mapping(Path(mapping)), believed)
         return assemble(

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from groundstation.reading.plausible import held
-from models.errors import InputError
-from models.flight import COLUMNS, Flight
-from models.record import FlightRecord, read_record
-from models.vehicle import Vehicle, load_vehicle
+from trueflight.groundstation.reading.plausible import held
+from trueflight.models.errors import InputError
+from trueflight.models.flight import COLUMNS, Flight
+from trueflight.models.record import FlightRecord, read_record
+from trueflight.models.vehicle import Vehicle, load_vehicle
 
 COMMANDED = ("takeoff", "mission", "landing")
 """Phases in which the companion's own command flies the vehicle."""
@@ -37,7 +37,7 @@ def read_flight_record(path: Path, vehicle: str | Path | Vehicle | None = None) 
     `shadow_raw` (m/s², heading frame; 0 elsewhere). Raises `InputError` for a record without a vehicle, a
     flight, or any plausible column.
     """
-    from groundstation.reading.flight_file import assemble
+    from trueflight.groundstation.reading.flight_file import assemble
 
     record = read_record(path)
     believed = _vehicle(path, record, vehicle)

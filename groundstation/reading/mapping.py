@@ -32,10 +32,10 @@ from pathlib import Path
 
 import numpy as np
 
-from groundstation.reading.table import Table
-from models.errors import InputError
-from models.flight import COLUMNS
-from models.frames import (
+from trueflight.groundstation.reading.table import Table
+from trueflight.models.errors import InputError
+from trueflight.models.flight import COLUMNS
+from trueflight.models.frames import (
     enu_flu_from_ned_frd,
     enu_from_ned,
     flu_from_frd,
@@ -43,8 +43,8 @@ from models.frames import (
     quaternion_from_euler,
     rotate_inverse,
 )
-from models.outside import numbers, read_toml, shown
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.models.outside import numbers, read_toml, shown
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 FRAMES = ("enu_flu", "ned_frd")
 

@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from groundstation.reading.uniform import MOST_LOST, continuous_quaternion, segments
-from models.errors import InputError
-from models.flight import COLUMNS
-from models.frames import rotate
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.groundstation.reading.uniform import MOST_LOST, continuous_quaternion, segments
+from trueflight.models.errors import InputError
+from trueflight.models.flight import COLUMNS
+from trueflight.models.frames import rotate
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 LOWEST_RATE = 10.0  # Hz; below it neither rates nor drag can be told from noise
 SHORTEST = 2.0  # s

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from groundstation.reading.px4_log import Log, Topic
-from groundstation.reading.px4_thrust import commanded_thrust, motor_commands, rotor_speeds
-from groundstation.reading.uniform import continuous_quaternion
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, rotate
-from models.vehicle import Vehicle
+from trueflight.groundstation.reading.px4_log import Log, Topic
+from trueflight.groundstation.reading.px4_thrust import commanded_thrust, motor_commands, rotor_speeds
+from trueflight.groundstation.reading.uniform import continuous_quaternion
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, rotate
+from trueflight.models.vehicle import Vehicle
 
 RATE = 100.0
 """Hz of the clock that all topics are brought to."""
@@ -70,7 +70,7 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle) -> Flight:
     what was armed and not landed counts as flying. Heights are above the ground at each takeoff. Raises `InputError`
     for a log of another kind of aircraft, without a flight, or without a topic that is needed.
     """
-    from groundstation.reading.flight_file import assemble
+    from trueflight.groundstation.reading.flight_file import assemble
 
     check_multirotor(log)
     air, notes = airborne(log)

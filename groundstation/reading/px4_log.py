@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from models.outside import unreadable
+from trueflight.models.outside import unreadable
 
 TOPICS = (
     "actuator_armed",

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groundstation.reading.px4_log import Log, Topic
+from trueflight.groundstation.reading.px4_log import Log, Topic
 
 ENOUGH = 40.0
 """Hz; the first source that is this fast is taken, otherwise the fastest: PX4's default profile logs setpoints at 50

@@ -18,11 +18,11 @@ import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Header, Message, Schema
 
-from groundstation.reading.px4_log import TOPICS, Log, collect
-from groundstation.reading.uniform import continuous_quaternion
-from models.errors import InputError
-from models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, rotate
-from models.mcap_records import mcap_records
+from trueflight.groundstation.reading.px4_log import TOPICS, Log, collect
+from trueflight.groundstation.reading.uniform import continuous_quaternion
+from trueflight.models.errors import InputError
+from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, rotate
+from trueflight.models.mcap_records import mcap_records
 
 ADVICE = "record it with `ros2 bag record --storage mcap`, with the px4_msgs workspace sourced"
 OTHER_CLOCK = 60.0

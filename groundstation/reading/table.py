@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from groundstation.reading.csv_text import read_csv_text
-from models.errors import InputError
-from models.flight import COLUMNS
-from models.outside import shown, unreadable
+from trueflight.groundstation.reading.csv_text import read_csv_text
+from trueflight.models.errors import InputError
+from trueflight.models.flight import COLUMNS
+from trueflight.models.outside import shown, unreadable
 
 OWN_NAMES = tuple(name for names, _, _ in COLUMNS.values() for name in names)
 """Names of all columns of the project's own CSV, besides `t` and `flying`."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from groundstation.reading.px4_flight import flight_of
-from groundstation.reading.px4_log import load_ulog
-from models.flight import Flight
-from models.vehicle import Vehicle
+from trueflight.groundstation.reading.px4_flight import flight_of
+from trueflight.groundstation.reading.px4_log import load_ulog
+from trueflight.models.flight import Flight
+from trueflight.models.vehicle import Vehicle
 
 
 def read_ulog(path: Path, vehicle: Vehicle) -> Flight:

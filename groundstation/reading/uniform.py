@@ -10,7 +10,7 @@ import itertools
 
 import numpy as np
 
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 GAP_PERIODS = 4.5
 GAP_SECONDS = 0.05

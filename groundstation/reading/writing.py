@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from models.errors import InputError
-from models.flight import COLUMNS, Flight
-from models.record import vehicle_to_toml
-from models.whole_file import whole_file, write_whole
+from trueflight.models.errors import InputError
+from trueflight.models.flight import COLUMNS, Flight
+from trueflight.models.record import vehicle_to_toml
+from trueflight.models.whole_file import whole_file, write_whole
 
 DIGITS = 9
 

@@ -1,5 +1,12 @@
 """One self-contained HTML page of an analysis, for those who were not there."""
 
-from groundstation.report.page import SECTIONS, Section, chosen, render, render_side_by_side, write_report
+from trueflight.groundstation.report.page import (
+    SECTIONS,
+    Section,
+    chosen,
+    render,
+    render_side_by_side,
+    write_report,
+)
 
 __all__ = ["SECTIONS", "Section", "chosen", "render", "render_side_by_side", "write_report"]

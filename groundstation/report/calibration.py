@@ -12,11 +12,11 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from groundstation.evaluate.calibration import NOTHING, OUTCOMES
-from groundstation.output.cited import Told, environment
-from groundstation.report.page import write_report
-from groundstation.report.svg import COLOURS, LIGHT, figure, light_style, style, to_svg
-from models.whole_file import whole_file
+from trueflight.groundstation.evaluate.calibration import NOTHING, OUTCOMES
+from trueflight.groundstation.output.cited import Told, environment
+from trueflight.groundstation.report.page import write_report
+from trueflight.groundstation.report.svg import COLOURS, LIGHT, figure, light_style, style, to_svg
+from trueflight.models.whole_file import whole_file
 
 Table = dict[str, Any]
 Colours = Mapping[str, str]

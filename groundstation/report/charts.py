@@ -10,13 +10,13 @@ from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from groundstation.evaluate.analysis import Analysis
-from groundstation.evaluate.side_by_side import SideBySide
-from groundstation.evaluate.tracking import Tracking
-from groundstation.output.cited import unit
-from groundstation.report.svg import BESIDE, COLOURS, ERROR, LEVELS, figure, level, to_svg
-from groundstation.results import Comparison
-from groundstation.views.error import rolling_rms
+from trueflight.groundstation.evaluate.analysis import Analysis
+from trueflight.groundstation.evaluate.side_by_side import SideBySide
+from trueflight.groundstation.evaluate.tracking import Tracking
+from trueflight.groundstation.output.cited import unit
+from trueflight.groundstation.report.svg import BESIDE, COLOURS, ERROR, LEVELS, figure, level, to_svg
+from trueflight.groundstation.results import Comparison
+from trueflight.groundstation.views.error import rolling_rms
 
 WIDTH = 7.4
 WINDOW = 12.0

@@ -9,13 +9,13 @@ from typing import Any
 
 from markupsafe import Markup
 
-from groundstation.evaluate.analysis import Analysis
-from groundstation.evaluate.side_by_side import SideBySide
-from groundstation.output.cited import Told, environment, sentences
-from groundstation.report import charts
-from groundstation.report.svg import style
-from models.errors import InputError
-from models.whole_file import write_whole
+from trueflight.groundstation.evaluate.analysis import Analysis
+from trueflight.groundstation.evaluate.side_by_side import SideBySide
+from trueflight.groundstation.output.cited import Told, environment, sentences
+from trueflight.groundstation.report import charts
+from trueflight.groundstation.report.svg import style
+from trueflight.models.errors import InputError
+from trueflight.models.whole_file import write_whole
 
 Table = dict[str, Any]
 Charts = dict[str, Markup | None]

@@ -22,19 +22,19 @@ from typing import Any
 
 import numpy as np
 
-from groundstation.evaluate.calibration import Case, case_from_table
-from groundstation.operate.processes import run_json
-from models.contract import LQR, LQR_INTEGRAL
-from models.database import database
-from models.design import load_design
-from models.effects import catalogue
-from models.errors import InputError
-from models.outside import json_object, read_text
-from models.reference import trajectory
-from models.trajectory import Segment, Trajectory, transfer
-from models.vehicle import GRAVITY, Vehicle, load_vehicle
-from models.whole_file import write_whole
-from models.workers import interrupts_held, worker_pool
+from trueflight.groundstation.evaluate.calibration import Case, case_from_table
+from trueflight.groundstation.operate.processes import run_json
+from trueflight.models.contract import LQR, LQR_INTEGRAL
+from trueflight.models.database import database
+from trueflight.models.design import load_design
+from trueflight.models.effects import catalogue
+from trueflight.models.errors import InputError
+from trueflight.models.outside import json_object, read_text
+from trueflight.models.reference import trajectory
+from trueflight.models.trajectory import Segment, Trajectory, transfer
+from trueflight.models.vehicle import GRAVITY, Vehicle, load_vehicle
+from trueflight.models.whole_file import write_whole
+from trueflight.models.workers import interrupts_held, worker_pool
 
 SHARES = {0: 0.3, 1: 0.4, 2: 0.2, 3: 0.1}
 """Share of the flights with so many effects hidden in them."""
@@ -339,10 +339,10 @@ def fly(study: Study, sortie: Sortie) -> dict[str, Any]:
 
 def diagnose_record(study: Study, sortie: Sortie) -> dict[str, Any]:
     """Diagnose a record as any flight, or tell what was found before; its failure is told under "error"."""
-    from groundstation.identify.translation import diagnose
-    from groundstation.output.as_json import diagnosis_table
-    from groundstation.reading import read_flight
-    from models.model import rigid_body_model
+    from trueflight.groundstation.identify.translation import diagnose
+    from trueflight.groundstation.output.as_json import diagnosis_table
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.models.model import rigid_body_model
 
     kept = (study.folder / sortie.name).with_suffix(".diagnosis.json")
     if kept.exists():

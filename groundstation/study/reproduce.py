@@ -18,22 +18,22 @@ from typing import Any
 
 import numpy as np
 
-from groundstation.evaluate.tracking import track_file
-from groundstation.identify.actuation import actuation_of
-from groundstation.identify.translation import diagnose
-from groundstation.learn.training import train
-from groundstation.learn.training_data import samples_of_flights
-from groundstation.operate.processes import run_json, running_rig
-from groundstation.reading import read_flight
-from groundstation.versions.store import add_effect
-from models.contract import CORRECTED, LQR, LQR_INTEGRAL
-from models.errors import InputError
-from models.export import export_onnx
-from models.flight import Flight
-from models.model import Model, linear_model, rigid_body_model, write_model
-from models.outside import json_object, read_text
-from models.vehicle import load_vehicle
-from models.whole_file import write_whole
+from trueflight.groundstation.evaluate.tracking import track_file
+from trueflight.groundstation.identify.actuation import actuation_of
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.learn.training import train
+from trueflight.groundstation.learn.training_data import samples_of_flights
+from trueflight.groundstation.operate.processes import run_json, running_rig
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.versions.store import add_effect
+from trueflight.models.contract import CORRECTED, LQR, LQR_INTEGRAL
+from trueflight.models.errors import InputError
+from trueflight.models.export import export_onnx
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model, linear_model, rigid_body_model, write_model
+from trueflight.models.outside import json_object, read_text
+from trueflight.models.vehicle import load_vehicle
+from trueflight.models.whole_file import write_whole
 
 UNSEEN = 100
 """Added to a seed for the trajectories of the scenarios: no training database holds them."""
@@ -338,8 +338,8 @@ def fly_companion(
 def _fly_companion(
     vehicle: Path, prepared: Prepared, truth: Sequence[str], scenario: Scenario, arm: Arm, rig: Path
 ) -> Flown:
-    from groundstation.operate.link import Link
-    from groundstation.operate.settings import Settings
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.settings import Settings
 
     rig.mkdir(exist_ok=True)
     words = [*truth, "--seed", str(prepared.seed), *scenario.truth]
@@ -365,7 +365,7 @@ def _fly_companion(
         record = link.fetch_record(entry["record"], rig)
     guard = ""
     if arm.model:
-        from models.record import read_record
+        from trueflight.models.record import read_record
 
         flags = read_record(record).ticks["guard"]
         guard = next((str(g) for g in flags if "tripped" in str(g)), "active")

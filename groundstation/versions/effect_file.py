@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from models.effects import catalogue
-from models.errors import InputError
-from models.whole_file import write_whole
+from trueflight.models.effects import catalogue
+from trueflight.models.errors import InputError
+from trueflight.models.whole_file import write_whole
 
 
 def write_effect_file(name: str, source: str, folder: Path) -> Path:

@@ -9,14 +9,22 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from groundstation.identify.fitting import Problem, fit, model_of
-from groundstation.identify.rotation import fit_rotation
-from groundstation.measured.measurement import measure
-from models.effects import effect_named
-from models.errors import InputError
-from models.flight import Flight
-from models.model import Model, Term, Unfinished, linear_model, read_model, rigid_body_model, write_model
-from models.vehicle import Vehicle
+from trueflight.groundstation.identify.fitting import Problem, fit, model_of
+from trueflight.groundstation.identify.rotation import fit_rotation
+from trueflight.groundstation.measured.measurement import measure
+from trueflight.models.effects import effect_named
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.model import (
+    Model,
+    Term,
+    Unfinished,
+    linear_model,
+    read_model,
+    rigid_body_model,
+    write_model,
+)
+from trueflight.models.vehicle import Vehicle
 
 DEFAULT_STORE = Path("trueflight-models")
 

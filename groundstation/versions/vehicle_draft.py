@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groundstation.reading.px4_flight import (
+from trueflight.groundstation.reading.px4_flight import (
     ACCELEROMETER,
     FAST,
     RATE,
@@ -24,12 +24,12 @@ from groundstation.reading.px4_flight import (
     motor_count,
     period_mean,
 )
-from groundstation.reading.px4_log import Log
-from groundstation.reading.px4_thrust import commanded_thrust
-from models.errors import InputError
-from models.outside import toml_table
-from models.vehicle import GRAVITY, Vehicle, vehicle_from_table
-from models.whole_file import write_whole
+from trueflight.groundstation.reading.px4_log import Log
+from trueflight.groundstation.reading.px4_thrust import commanded_thrust
+from trueflight.models.errors import InputError
+from trueflight.models.outside import toml_table
+from trueflight.models.vehicle import GRAVITY, Vehicle, vehicle_from_table
+from trueflight.models.whole_file import write_whole
 
 STAND_IN_MASS = 1.0  # kg
 CELL = 3.7  # V, a lithium cell in the middle of its discharge

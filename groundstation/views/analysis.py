@@ -8,18 +8,18 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.evaluate.analysis import Analysis
-from groundstation.output.as_json import analysis_table
-from groundstation.output.cited import Told, environment, sentences
-from groundstation.views.bars import bar_groups
-from groundstation.views.colour import NEWEST, WARNING, Colour, of_version
-from groundstation.views.comparison import comparison_panel
-from groundstation.views.error import error_curves, error_over_time, moments_log
-from groundstation.views.recording import page, recording, text
-from groundstation.views.side_by_side import side_by_side_panel
-from groundstation.views.tracking import tracking_panel
-from groundstation.views.waterfall import waterfall_bars, waterfall_panel
-from groundstation.views.where import where_panel
+from trueflight.groundstation.evaluate.analysis import Analysis
+from trueflight.groundstation.output.as_json import analysis_table
+from trueflight.groundstation.output.cited import Told, environment, sentences
+from trueflight.groundstation.views.bars import bar_groups
+from trueflight.groundstation.views.colour import NEWEST, WARNING, Colour, of_version
+from trueflight.groundstation.views.comparison import comparison_panel
+from trueflight.groundstation.views.error import error_curves, error_over_time, moments_log
+from trueflight.groundstation.views.recording import page, recording, text
+from trueflight.groundstation.views.side_by_side import side_by_side_panel
+from trueflight.groundstation.views.tracking import tracking_panel
+from trueflight.groundstation.views.waterfall import waterfall_bars, waterfall_panel
+from trueflight.groundstation.views.where import where_panel
 
 SMOOTHING = 1.0  # s
 

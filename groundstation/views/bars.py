@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.views.colour import Colour, of_error
+from trueflight.groundstation.views.colour import Colour, of_error
 
 WIDTH = 100.0
 """Length of the legend, in units of its plane."""

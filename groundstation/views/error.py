@@ -9,11 +9,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.results import Comparison, Moment
-from groundstation.views import scene
-from groundstation.views.bars import legend
-from groundstation.views.colour import FLOOR, WARNING, Colour
-from groundstation.views.recording import TIME, between, curve
+from trueflight.groundstation.results import Comparison, Moment
+from trueflight.groundstation.views import scene
+from trueflight.groundstation.views.bars import legend
+from trueflight.groundstation.views.colour import FLOOR, WARNING, Colour
+from trueflight.groundstation.views.recording import TIME, between, curve
 
 MARKED = 3
 """Worst moments that are marked in space."""

@@ -13,13 +13,13 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.operate.link import Link
-from groundstation.views import scene
-from groundstation.views.colour import AXES, LINEAR, MEASURED, NEWEST, REFERENCE, WARNING, Colour
-from groundstation.views.recording import TIME, recording, text
-from models.errors import InputError
-from models.record_pb2 import Event, Tick, Vector3
-from models.vehicle import Vehicle
+from trueflight.groundstation.operate.link import Link
+from trueflight.groundstation.views import scene
+from trueflight.groundstation.views.colour import AXES, LINEAR, MEASURED, NEWEST, REFERENCE, WARNING, Colour
+from trueflight.groundstation.views.recording import TIME, recording, text
+from trueflight.models.errors import InputError
+from trueflight.models.record_pb2 import Event, Tick, Vector3
+from trueflight.models.vehicle import Vehicle
 
 PERIOD = 0.1  # s between two updates of the picture
 TRAIL = 30.0  # s of path that stay in sight

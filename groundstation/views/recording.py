@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from models.whole_file import whole_file
+from trueflight.models.whole_file import whole_file
 
 TIME = "flight_time"
 """The timeline of everything that happened in a flight: s on the flight's clock."""

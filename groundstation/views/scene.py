@@ -6,9 +6,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.views.colour import Colour, of_error
-from groundstation.views.recording import TIME, thin
-from models.vehicle import Vehicle
+from trueflight.groundstation.views.colour import Colour, of_error
+from trueflight.groundstation.views.recording import TIME, thin
+from trueflight.models.vehicle import Vehicle
 
 DRAWN_SIZE = 0.03
 """Least share of the scene that the vehicle is drawn with, so that a small one far away is still seen."""

@@ -8,11 +8,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.evaluate.side_by_side import SideBySide
-from groundstation.output.cited import written
-from groundstation.views.colour import AXES, BETWEEN, LINEAR, NEWEST, REFERENCE, Colour
-from groundstation.views.error import error_curves, error_legend, error_over_time, error_path
-from groundstation.views.recording import page, recording, text
+from trueflight.groundstation.evaluate.side_by_side import SideBySide
+from trueflight.groundstation.output.cited import written
+from trueflight.groundstation.views.colour import AXES, BETWEEN, LINEAR, NEWEST, REFERENCE, Colour
+from trueflight.groundstation.views.error import error_curves, error_legend, error_over_time, error_path
+from trueflight.groundstation.views.recording import page, recording, text
 
 COLOURS: tuple[Colour, ...] = (LINEAR, NEWEST, REFERENCE, *BETWEEN, *AXES)
 SMOOTHING = 0.5  # s

@@ -9,11 +9,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.evaluate.tracking import Tracking, told_apart
-from groundstation.views import scene
-from groundstation.views.bars import bar_groups
-from groundstation.views.colour import EXPECTED, NEWEST, Colour, of_version
-from groundstation.views.recording import curve, page, recording, text
+from trueflight.groundstation.evaluate.tracking import Tracking, told_apart
+from trueflight.groundstation.views import scene
+from trueflight.groundstation.views.bars import bar_groups
+from trueflight.groundstation.views.colour import EXPECTED, NEWEST, Colour, of_version
+from trueflight.groundstation.views.recording import curve, page, recording, text
 
 
 def write_tracking(path: Path, tracked: Sequence[Tracking]) -> None:

@@ -9,13 +9,13 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.learn.ablation import Ablation, Architecture
-from groundstation.learn.training import Training
-from groundstation.learn.training_data import Samples
-from groundstation.views.bars import words
-from groundstation.views.colour import AXES, FLOOR, LINEAR, NEWEST, WARNING, Colour
-from groundstation.views.recording import recording, text
-from models.network import error_acceleration_of
+from trueflight.groundstation.learn.ablation import Ablation, Architecture
+from trueflight.groundstation.learn.training import Training
+from trueflight.groundstation.learn.training_data import Samples
+from trueflight.groundstation.views.bars import words
+from trueflight.groundstation.views.colour import AXES, FLOOR, LINEAR, NEWEST, WARNING, Colour
+from trueflight.groundstation.views.recording import recording, text
+from trueflight.models.network import error_acceleration_of
 
 EPOCH = "epoch"
 """The timeline of a training."""

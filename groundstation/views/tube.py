@@ -8,10 +8,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.evaluate.bound import Tube
-from groundstation.views import scene
-from groundstation.views.colour import FLOOR, LINEAR, NEWEST, REFERENCE
-from groundstation.views.recording import TIME, curve, recording, text, thin
+from trueflight.groundstation.evaluate.bound import Tube
+from trueflight.groundstation.views import scene
+from trueflight.groundstation.views.colour import FLOOR, LINEAR, NEWEST, REFERENCE
+from trueflight.groundstation.views.recording import TIME, curve, recording, text, thin
 
 BALLS = 60
 """Balls drawn along the middle of the tube at most; more hide the path."""

@@ -8,10 +8,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from groundstation.results import Comparison, ErrorMap, PlaceMap, WhereItFails
-from groundstation.views import scene
-from groundstation.views.colour import FLOOR, NEWEST, REFERENCE, of_error
-from groundstation.views.error import (
+from trueflight.groundstation.results import Comparison, ErrorMap, PlaceMap, WhereItFails
+from trueflight.groundstation.views import scene
+from trueflight.groundstation.views.colour import FLOOR, NEWEST, REFERENCE, of_error
+from trueflight.groundstation.views.error import (
     ErrorOverTime,
     error_curves,
     error_legend,
@@ -19,7 +19,7 @@ from groundstation.views.error import (
     error_path,
     moments_log,
 )
-from groundstation.views.recording import page, recording, text, thin
+from trueflight.groundstation.views.recording import page, recording, text, thin
 
 MAPS = 6
 SMOOTHING = 0.3  # s

@@ -9,8 +9,8 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from models.effect import Effect
-from models.errors import InputError
+from trueflight.models.effect import Effect
+from trueflight.models.errors import InputError
 
 
 @cache

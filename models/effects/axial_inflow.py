@@ -2,8 +2,8 @@
 
 from array_api_compat import array_namespace
 
-from models.effect import Array, Effect, Motion, Parameter, Stage
-from models.vehicle import GRAVITY
+from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.vehicle import GRAVITY
 
 
 def formula(motion: Motion, *, slope: Array) -> Motion:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from array_api_compat import array_namespace
 
-from models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
 
 STRONGEST = 0.6
 """Largest value of the squared ratio: nearer to the ceiling the formula leaves its range."""

@@ -2,7 +2,7 @@
 
 from array_api_compat import array_namespace
 
-from models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
 
 STRONGEST = 0.6
 """Largest value of the squared ratio: below about a third of a radius the formula leaves its range."""

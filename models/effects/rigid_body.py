@@ -1,6 +1,6 @@
 """Exact rotation of thrust, instead of the small angles of the hover linearisation."""
 
-from models.effect import Effect, Motion, Stage
+from trueflight.models.effect import Effect, Motion, Stage
 
 
 def formula(motion: Motion) -> Motion:

@@ -1,7 +1,7 @@
 """The map from command to thrust is not the assumed curve."""
 
-from models.effect import Array, Effect, Motion, Parameter, Stage
-from models.vehicle import GRAVITY
+from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.vehicle import GRAVITY
 
 
 def formula(motion: Motion, *, curvature: Array) -> Motion:

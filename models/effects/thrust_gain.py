@@ -1,6 +1,6 @@
 """Thrust over mass differs from the believed one by a factor."""
 
-from models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
 
 
 def formula(motion: Motion, *, gain: Array) -> Motion:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from models.effect import Effect, Motion, Parameter, Stage
+from trueflight.models.effect import Effect, Motion, Parameter, Stage
 
 
 def formula(motion: Motion, *, delay: float) -> Motion:

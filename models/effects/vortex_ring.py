@@ -4,8 +4,8 @@ import math
 
 from array_api_compat import array_namespace
 
-from models.effect import Array, Effect, Motion, Parameter, Stage
-from models.vehicle import GRAVITY
+from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.vehicle import GRAVITY
 
 AIR_DENSITY = 1.225
 """kg/m³ at sea level."""

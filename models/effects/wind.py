@@ -2,7 +2,7 @@
 
 from array_api_compat import array_namespace
 
-from models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
 
 
 def formula(motion: Motion, *, x: Array, y: Array) -> Motion:

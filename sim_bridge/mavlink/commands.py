@@ -8,13 +8,13 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mav
 
-from sim_bridge.autopilot import Autopilot, Verdict
-from sim_bridge.mavlink import wire
-from sim_bridge.mavlink.event import arming_report
-from sim_bridge.mavlink.peer import Peer
-from sim_bridge.mavlink.telemetry import STREAMS
-from sim_bridge.modes import Mode
-from sim_bridge.position_control import AttitudeSetpoint, MotionSetpoint, RateSetpoint, yaw_of
+from trueflight.sim_bridge.autopilot import Autopilot, Verdict
+from trueflight.sim_bridge.mavlink import wire
+from trueflight.sim_bridge.mavlink.event import arming_report
+from trueflight.sim_bridge.mavlink.peer import Peer
+from trueflight.sim_bridge.mavlink.telemetry import STREAMS
+from trueflight.sim_bridge.modes import Mode
+from trueflight.sim_bridge.position_control import AttitudeSetpoint, MotionSetpoint, RateSetpoint, yaw_of
 
 _FORCE = 21196.0  # param2 of MAV_CMD_COMPONENT_ARM_DISARM that overrides the checks
 _NAN = math.nan

@@ -9,7 +9,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mav
 
-from sim_bridge.mavlink.telemetry import ESTIMATOR_STREAMS, STREAMS
+from trueflight.sim_bridge.mavlink.telemetry import ESTIMATOR_STREAMS, STREAMS
 
 Address = tuple[str, int]
 

@@ -14,14 +14,14 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mav
 
-from models.errors import InputError
-from sim_bridge.autopilot import Autopilot, Verdict
-from sim_bridge.mavlink.commands import Commands
-from sim_bridge.mavlink.event import Event
-from sim_bridge.mavlink.peer import Address, Peer
-from sim_bridge.mavlink.telemetry import STREAMS
-from sim_bridge.modes import Mode
-from sim_bridge.world import PHYSICS_STEP
+from trueflight.models.errors import InputError
+from trueflight.sim_bridge.autopilot import Autopilot, Verdict
+from trueflight.sim_bridge.mavlink.commands import Commands
+from trueflight.sim_bridge.mavlink.event import Event
+from trueflight.sim_bridge.mavlink.peer import Address, Peer
+from trueflight.sim_bridge.mavlink.telemetry import STREAMS
+from trueflight.sim_bridge.modes import Mode
+from trueflight.sim_bridge.world import PHYSICS_STEP
 
 _BEHIND = 0.25  # s of wall time behind schedule after which the schedule is moved instead of caught up
 _FORGET_US = 10_000_000  # a partner that connected by itself is forgotten after so much silence

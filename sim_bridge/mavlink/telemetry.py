@@ -11,10 +11,10 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mav
 
-from sim_bridge.autopilot import Autopilot, Landed
-from sim_bridge.mavlink import wire
-from sim_bridge.mavlink.esc_status import ESC_STATUS, EscStatus
-from sim_bridge.modes import Mode
+from trueflight.sim_bridge.autopilot import Autopilot, Landed
+from trueflight.sim_bridge.mavlink import wire
+from trueflight.sim_bridge.mavlink.esc_status import ESC_STATUS, EscStatus
+from trueflight.sim_bridge.modes import Mode
 
 Build = Callable[[Autopilot], Any]
 

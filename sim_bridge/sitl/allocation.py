@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from models.errors import InputError
-from models.vehicle import Vehicle
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle
 
 FIRST_MOTOR = 101
 """PX4's output function of motor 1 (PWM_MAIN_FUNCn); motor i is CA_ROTOR(i - 1)."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from enum import Enum
 
-from models.errors import InputError
-from models.vehicle import Vehicle
-from sim_bridge.sitl.allocation import Expected, differences, expected_parameters
-from sim_bridge.sitl.px4_link import Px4Link
-from sim_bridge.truth.battery import Battery
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.sitl.allocation import Expected, differences, expected_parameters
+from trueflight.sim_bridge.sitl.px4_link import Px4Link
+from trueflight.sim_bridge.truth.battery import Battery
 
 _PATIENCE_US = 20_000_000  # of PX4's clock, from its first stream on
 _ATTEMPTS = 3

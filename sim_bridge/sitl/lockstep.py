@@ -20,12 +20,18 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mav
 
-from models.errors import InputError
-from sim_bridge.mavlink import wire
-from sim_bridge.mavlink.stream import MessageStream
-from sim_bridge.simulator import Moment, Simulator
-from sim_bridge.sitl.sensors import FORCE_STEP, RATE_STEP, RawSensors, pressure_altitude, rounded_by_px4
-from sim_bridge.world import PHYSICS_STEP
+from trueflight.models.errors import InputError
+from trueflight.sim_bridge.mavlink import wire
+from trueflight.sim_bridge.mavlink.stream import MessageStream
+from trueflight.sim_bridge.simulator import Moment, Simulator
+from trueflight.sim_bridge.sitl.sensors import (
+    FORCE_STEP,
+    RATE_STEP,
+    RawSensors,
+    pressure_altitude,
+    rounded_by_px4,
+)
+from trueflight.sim_bridge.world import PHYSICS_STEP
 
 SENSOR_STEPS = 2
 """Physics steps between two HIL_SENSOR messages: 250 Hz, PX4's IMU_INTEG_RATE in simulation."""

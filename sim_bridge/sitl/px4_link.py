@@ -9,10 +9,10 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mav
 
-from models.errors import InputError
-from sim_bridge.mavlink import wire
-from sim_bridge.mavlink.peer import Peer
-from sim_bridge.truth.battery import Battery
+from trueflight.models.errors import InputError
+from trueflight.sim_bridge.mavlink import wire
+from trueflight.sim_bridge.mavlink.peer import Peer
+from trueflight.sim_bridge.truth.battery import Battery
 
 PAYLOAD_PORT = 14030
 """Where PX4's simulation sends its second onboard stream (instance 0): a port that neither a companion nor a ground

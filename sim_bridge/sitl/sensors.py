@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from models.vehicle import GRAVITY
-from sim_bridge.mavlink import wire
-from sim_bridge.mavlink.wire import Quaternion, Vector
-from sim_bridge.simulator import Moment
+from trueflight.models.vehicle import GRAVITY
+from trueflight.sim_bridge.mavlink import wire
+from trueflight.sim_bridge.mavlink.wire import Quaternion, Vector
+from trueflight.sim_bridge.simulator import Moment
 
 FIELD = (0.0127, 0.2175, -0.4310)
 """The Earth's magnetic field at `wire.ORIGIN`, gauss, ENU (World Magnetic Model 2025: 48.3 microtesla, 63.2 deg down,

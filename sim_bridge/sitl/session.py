@@ -17,12 +17,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from models.errors import InputError
-from models.vehicle import Vehicle
-from sim_bridge.settings import Settings
-from sim_bridge.simulator import Simulator
-from sim_bridge.sitl.allocation import expected_parameters
-from sim_bridge.sitl.check import (
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.settings import Settings
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.sitl.allocation import expected_parameters
+from trueflight.sim_bridge.sitl.check import (
     HOVER,
     NO_GPS,
     OWN_BATTERY,
@@ -30,11 +30,11 @@ from sim_bridge.sitl.check import (
     AllocationCheck,
     State,
 )
-from sim_bridge.sitl.lockstep import Ending, Lockstep, Offer, Position, Progress, listen
-from sim_bridge.sitl.px4_link import PAYLOAD_PORT, Px4Link
-from sim_bridge.sitl.sensors import RawNoise, RawSensors
-from sim_bridge.sitl.truth_table import TruthTable
-from sim_bridge.truth.hidden import Hidden
+from trueflight.sim_bridge.sitl.lockstep import Ending, Lockstep, Offer, Position, Progress, listen
+from trueflight.sim_bridge.sitl.px4_link import PAYLOAD_PORT, Px4Link
+from trueflight.sim_bridge.sitl.sensors import RawNoise, RawSensors
+from trueflight.sim_bridge.sitl.truth_table import TruthTable
+from trueflight.sim_bridge.truth.hidden import Hidden
 
 FIRST_PORT = 4560
 _INSTANCES = 10

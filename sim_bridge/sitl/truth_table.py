@@ -6,10 +6,10 @@ import csv
 from pathlib import Path
 from types import TracebackType
 
-from models.flight import COLUMNS
-from models.whole_file import whole_file
-from sim_bridge.simulator import Simulator
-from sim_bridge.sitl.sensors import specific_force
+from trueflight.models.flight import COLUMNS
+from trueflight.models.whole_file import whole_file
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.sitl.sensors import specific_force
 
 _COLUMNS = (
     *("position", "velocity", "quaternion", "angular_velocity", "specific_force"),

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import sqrt
 
-from models.vehicle import Vehicle
-from sim_bridge.truth.battery import Battery, BatteryCell, battery_for
+from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.truth.battery import Battery, BatteryCell, battery_for
 
 AIR_DENSITY = 1.225
 """kg/m³ at sea level."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 
-from models.vehicle import Vehicle
+from trueflight.models.vehicle import Vehicle
 
 # Rest voltage of one lithium-polymer cell over its state of charge, a typical curve (Plett, "Battery
 # Management Systems I", 2015, section 2.2, shows the shape).

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from math import sqrt
 from typing import ClassVar
 
-from models.errors import InputError
-from models.vehicle import GRAVITY, Vehicle
-from sim_bridge.truth.airframe import AIR_DENSITY, Act, Airframe, Motion, Powertrain
-from sim_bridge.truth.sensors import Sensors
-from sim_bridge.world import PHYSICS_STEP, World
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.sim_bridge.truth.airframe import AIR_DENSITY, Act, Airframe, Motion, Powertrain
+from trueflight.sim_bridge.truth.sensors import Sensors
+from trueflight.sim_bridge.world import PHYSICS_STEP, World
 
 Event = tuple[float, Callable[[World], None]]
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from models.vehicle import GRAVITY
+from trueflight.models.vehicle import GRAVITY
 
 
 class Estimate(NamedTuple):

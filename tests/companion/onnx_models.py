@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from models import contract
+from trueflight.models import contract
 
 RANGES = {
     "z": (0.0, 4.0),

@@ -17,9 +17,9 @@ from typing import Any
 
 import zenoh
 
-from companion.vehicle_link import mode_name
-from models import contract
-from models.record_pb2 import Event, Tick
+from trueflight.companion.vehicle_link import mode_name
+from trueflight.models import contract
+from trueflight.models.record_pb2 import Event, Tick
 
 VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
 HEARTBEAT, SET_ATTITUDE_TARGET, VISION_POSITION_ESTIMATE, ODOMETRY = 0, 82, 102, 331
@@ -99,7 +99,7 @@ class Bridge(Process):
 
     def __init__(self, port: int, *flags: str) -> None:
         self.port, self.pilot_port = free_port(), free_port()
-        program = "from sim_bridge.cli import main; main()"
+        program = "from trueflight.sim_bridge.cli import main; main()"
         super().__init__(
             ["-c", program, "run", "--vehicle", str(VEHICLE), "--mavlink", f"udpout:127.0.0.1:{port}"]
             + ["--port", str(self.port), "--pilot-port", str(self.pilot_port), *flags]
@@ -200,7 +200,7 @@ class Companion(Process):
             config.write_text(settings)
             flags = (*flags, "--config", str(config))
         self.zenoh_port = free_port(socket.SOCK_STREAM)
-        program = f"{before}\nfrom companion.cli import main; main()"
+        program = f"{before}\nfrom trueflight.companion.cli import main; main()"
         super().__init__(
             [
                 "-c",

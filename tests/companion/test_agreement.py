@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.agreement import Agreement, AgreementLimits, _turned, rotated
-from companion.vehicle_link import ImuSample, Odometry
-from models import frames
-from models.design import load_design
-from models.reference import trajectory
-from models.vehicle import load_vehicle
-from sim_bridge.in_process import Plan, Sample, fly
-from sim_bridge.truth.hidden import choose
+from trueflight.companion.agreement import Agreement, AgreementLimits, _turned, rotated
+from trueflight.companion.vehicle_link import ImuSample, Odometry
+from trueflight.models import frames
+from trueflight.models.design import load_design
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import load_vehicle
+from trueflight.sim_bridge.in_process import Plan, Sample, fly
+from trueflight.sim_bridge.truth.hidden import choose
 
 QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5"
 numbers = st.floats(-1.0, 1.0)

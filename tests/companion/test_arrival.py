@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.arrival import ASK_EVERY, Arrivals
+from trueflight.companion.arrival import ASK_EVERY, Arrivals
 
 MS, S = 1_000_000, 1_000_000_000
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from rig import SET_ATTITUDE_TARGET, Bridge, Companion, Wiretap, wait_for
 
-from models.record import FlightRecord, read_record
+from trueflight.models.record import FlightRecord, read_record
 
 FOREVER = {"trajectory": "hover", "parameters": {"duration": 600.0}}
 

@@ -7,7 +7,7 @@ import math
 import pytest
 from test_flight import Rig, fly, kinds
 
-from companion.flight import LANDING, MISSION, SILENT, Safety
+from trueflight.companion.flight import LANDING, MISSION, SILENT, Safety
 
 
 def hovering() -> Rig:

@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 from rig import VEHICLE, Bridge, free_port
 
-from companion.settings import Settings, load_settings
-from models.errors import InputError
+from trueflight.companion.settings import Settings, load_settings
+from trueflight.models.errors import InputError
 
 EXAMPLE = Path(__file__).parents[2] / "companion" / "companion.toml"
 
 
 def companion(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", "from companion.cli import main; main()", *map(str, arguments)],
+        [sys.executable, "-c", "from trueflight.companion.cli import main; main()", *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=90,

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.control import ControlLaw, Limits, State, euler, features
-from models import frames
-from models.contract import FEATURES, YAW_FEATURES
-from models.design import hover_input_matrix, load_design
-from models.errors import InputError
-from models.trajectory import ReferenceSample
-from models.vehicle import GRAVITY, load_vehicle
+from trueflight.companion.control import ControlLaw, Limits, State, euler, features
+from trueflight.models import frames
+from trueflight.models.contract import FEATURES, YAW_FEATURES
+from trueflight.models.design import hover_input_matrix, load_design
+from trueflight.models.errors import InputError
+from trueflight.models.trajectory import ReferenceSample
+from trueflight.models.vehicle import GRAVITY, load_vehicle
 
 QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5"
 VEHICLE = load_vehicle(QUAD5 / "vehicle.toml")

@@ -13,19 +13,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.actuation import ACTS_AT_ONCE, Actuation, LagInverse, RateModel
-from companion.behaviour import LinearBehaviour
-from companion.control import ZERO, ControlLaw, State, euler
-from companion.controllers import Corrected, Lqr, LqrIntegral, TrimLimits, make_controller
-from companion.guard import Correction
-from groundstation.design.linear_response import Reference, expected_behaviour
-from groundstation.identify.actuation import respond
-from models import frames
-from models.design import load_design
-from models.errors import InputError
-from models.reference import trajectory
-from models.trajectory import ReferenceSample, Trajectory
-from models.vehicle import GRAVITY, load_vehicle
+from trueflight.companion.actuation import ACTS_AT_ONCE, Actuation, LagInverse, RateModel
+from trueflight.companion.behaviour import LinearBehaviour
+from trueflight.companion.control import ZERO, ControlLaw, State, euler
+from trueflight.companion.controllers import Corrected, Lqr, LqrIntegral, TrimLimits, make_controller
+from trueflight.companion.guard import Correction
+from trueflight.groundstation.design.linear_response import Reference, expected_behaviour
+from trueflight.groundstation.identify.actuation import respond
+from trueflight.models import frames
+from trueflight.models.design import load_design
+from trueflight.models.errors import InputError
+from trueflight.models.reference import trajectory
+from trueflight.models.trajectory import ReferenceSample, Trajectory
+from trueflight.models.vehicle import GRAVITY, load_vehicle
 
 QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5"
 VEHICLE = load_vehicle(QUAD5 / "vehicle.toml")

@@ -23,12 +23,12 @@ from onnx_models import (
 )
 from rig import PATIENT, Bridge, Companion, free_port, wait_for
 
-from companion import inspection
-from companion.store import ModelStore
-from companion.watch import GuardLimits
-from models import contract
-from models.record import FlightRecord, read_record
-from models.vehicle import load_vehicle
+from trueflight.companion import inspection
+from trueflight.companion.store import ModelStore
+from trueflight.companion.watch import GuardLimits
+from trueflight.models import contract
+from trueflight.models.record import FlightRecord, read_record
+from trueflight.models.vehicle import load_vehicle
 
 SPEED = "2"
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
@@ -277,7 +277,7 @@ def test_the_ground_deploys_waits_and_takes_back_from_the_command_line(
     companion: Companion, tmp_path: Path
 ) -> None:
     def ground(*arguments: object) -> subprocess.CompletedProcess[str]:
-        program = "from groundstation.commands.app import main; main()"
+        program = "from trueflight.groundstation.commands.app import main; main()"
         line = [sys.executable, "-c", program, *map(str, arguments)]
         line += ["-e", f"tcp/127.0.0.1:{companion.zenoh_port}"]
         return subprocess.run(line, capture_output=True, text=True, timeout=60.0)

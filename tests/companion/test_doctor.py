@@ -12,12 +12,12 @@ from onnx_models import drag_model
 from rig import VEHICLE, Bridge, free_port
 from test_companion_cli import companion
 
-from companion import doctor
-from companion.findings import FAIL, NOTE, OK, WARN, Finding
-from companion.settings import Settings
-from companion.store import ModelStore
-from companion.zenoh_session import ZenohSettings
-from models.vehicle import load_vehicle
+from trueflight.companion import doctor
+from trueflight.companion.findings import FAIL, NOTE, OK, WARN, Finding
+from trueflight.companion.settings import Settings
+from trueflight.companion.store import ModelStore
+from trueflight.companion.zenoh_session import ZenohSettings
+from trueflight.models.vehicle import load_vehicle
 
 
 def write(root: Path, name: str, text: str = "") -> Path:

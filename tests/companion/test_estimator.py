@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as mav
 from rig import VEHICLE, Bridge, Companion, free_port, wait_for
 from test_companion_cli import companion
 
-from companion.estimator import EstimatorStatus, estimator_status
+from trueflight.companion.estimator import EstimatorStatus, estimator_status
 
 MOST = 2.0
 

@@ -10,16 +10,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.control import ControlLaw
-from companion.flight import IDLE, LANDING, MISSION, SILENT, TAKEOFF, Flight, Mission, Outcome, Safety
-from companion.guard import Guard
-from companion.vehicle_link import Latest, Odometry
-from companion.watch import Range, Watch
-from models.contract import FEATURES
-from models.design import load_design
-from models.errors import InputError
-from models.reference import trajectory
-from models.vehicle import GRAVITY, load_vehicle
+from trueflight.companion.control import ControlLaw
+from trueflight.companion.flight import (
+    IDLE,
+    LANDING,
+    MISSION,
+    SILENT,
+    TAKEOFF,
+    Flight,
+    Mission,
+    Outcome,
+    Safety,
+)
+from trueflight.companion.guard import Guard
+from trueflight.companion.vehicle_link import Latest, Odometry
+from trueflight.companion.watch import Range, Watch
+from trueflight.models.contract import FEATURES
+from trueflight.models.design import load_design
+from trueflight.models.errors import InputError
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import GRAVITY, load_vehicle
 
 QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5"
 VEHICLE = load_vehicle(QUAD5 / "vehicle.toml")

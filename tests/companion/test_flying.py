@@ -13,9 +13,9 @@ import pytest
 from onnx_models import constant_model, drag_model, linear_model
 from rig import PATIENT, Bridge, Companion, free_port, wait_for
 
-from models import contract, frames
-from models.record import FlightRecord, read_record
-from models.record_pb2 import Event
+from trueflight.models import contract, frames
+from trueflight.models.record import FlightRecord, read_record
+from trueflight.models.record_pb2 import Event
 
 SPEED = "2"
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.guard import Guard
-from companion.watch import GuardLimits, Range, Watch
-from models.contract import FEATURES
+from trueflight.companion.guard import Guard
+from trueflight.companion.watch import GuardLimits, Range, Watch
+from trueflight.models.contract import FEATURES
 
 LIMITS = GuardLimits(fade=0.5)
 RANGES = (Range("z", "m", 0.0, 2.0), Range("vx", "m/s", -2.0, 2.0))

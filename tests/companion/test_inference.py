@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from onnx_models import RANGES, constant_model, drag_model, linear_model
 
-from companion.inference import MAX_BYTES, check_model
-from companion.store import ModelStore
-from models import contract
-from models.vehicle import load_vehicle
+from trueflight.companion.inference import MAX_BYTES, check_model
+from trueflight.companion.store import ModelStore
+from trueflight.models import contract
+from trueflight.models.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
 RNG = np.random.default_rng(0)

@@ -14,11 +14,11 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from onnx_models import drag_model
 
-from companion import inspection
-from companion.inference import check_model
-from companion.onnx_structure import why_not_self_contained
-from models import contract
-from models.vehicle import load_vehicle
+from trueflight.companion import inspection
+from trueflight.companion.inference import check_model
+from trueflight.companion.onnx_structure import why_not_self_contained
+from trueflight.models import contract
+from trueflight.models.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
 SECRET = "/etc/passwd"
@@ -100,7 +100,7 @@ def test_weights_in_another_file_are_refused_before_a_runtime_sees_them(
 ) -> None:
     model = onnx.ModelProto.FromString(drag_model(0.1))
     PLACES[place](model)
-    monkeypatch.setattr("companion.inference._open", lambda onnx: pytest.fail("a runtime saw it"))
+    monkeypatch.setattr("trueflight.companion.inference._open", lambda onnx: pytest.fail("a runtime saw it"))
     verdict = check_model(model.SerializeToString(), VEHICLE)
     assert not verdict.accepted
     assert "external data" in verdict.reason
@@ -154,7 +154,7 @@ def test_a_chain_of_anything_but_effects_is_refused(entry: object) -> None:
 
 FENCES = """
 import json, os, socket
-from companion.confined import confine, leave_network
+from trueflight.companion.confined import confine, leave_network
 leave_network()
 missing = confine(64 << 20, 5)
 def tried(act):

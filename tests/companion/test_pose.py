@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mav
 from rig import PATIENT, Bridge, Companion, Wiretap, wait_for
 
-from companion.pose import PoseFeed, PoseGate, PoseSettings
-from companion.vehicle_link import vision_estimate
-from models import contract
-from models.pose import Pose, pose_from_json, pose_to_json
+from trueflight.companion.pose import PoseFeed, PoseGate, PoseSettings
+from trueflight.companion.vehicle_link import vision_estimate
+from trueflight.models import contract
+from trueflight.models.pose import Pose, pose_from_json, pose_to_json
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 coordinates = st.floats(-50.0, 50.0)

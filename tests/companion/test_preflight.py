@@ -14,11 +14,11 @@ import pytest
 from rig import VEHICLE, Bridge, free_port, wait_for
 from test_companion_cli import companion
 
-from companion.message_rates import odometry_too_low
-from companion.pose import PoseSettings
-from companion.preflight import hover_of, judge, wishes
-from companion.settings import Settings
-from companion.vehicle_link import Rates
+from trueflight.companion.message_rates import odometry_too_low
+from trueflight.companion.pose import PoseSettings
+from trueflight.companion.preflight import hover_of, judge, wishes
+from trueflight.companion.settings import Settings
+from trueflight.companion.vehicle_link import Rates
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ def test_too_low_a_rate_names_the_parameter(bridge: tuple[Bridge, int], tmp_path
 
 
 def test_an_armed_vehicle_is_left_alone(bridge: tuple[Bridge, int], tmp_path: Path) -> None:
-    from companion.vehicle_link import VehicleLink
+    from trueflight.companion.vehicle_link import VehicleLink
 
     port = bridge[1]
     link = VehicleLink(f"udpin://127.0.0.1:{port}")

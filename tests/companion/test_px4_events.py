@@ -6,8 +6,15 @@ import struct
 
 import pytest
 
-from companion.px4_checks import CHECKS
-from companion.px4_events import ArmingChecks, Px4Event, describe, event_number, problem_of, unhealthy
+from trueflight.companion.px4_checks import CHECKS
+from trueflight.companion.px4_events import (
+    ArmingChecks,
+    Px4Event,
+    describe,
+    event_number,
+    problem_of,
+    unhealthy,
+)
 
 # What PX4 1.15.2 sent after MAV_CMD_RUN_PREARM_CHECKS, some seconds after its start: number, levels, arguments.
 STARTING = (

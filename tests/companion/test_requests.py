@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from companion.mission_request import SMALL, mission_request, read_json, read_request
-from models.contract import REQUEST_BYTES, too_large
-from models.errors import InputError
-from models.pose import pose_from_json
-from models.reference import LONGEST, MOST_ROWS, trajectory_from_csv
+from trueflight.companion.mission_request import SMALL, mission_request, read_json, read_request
+from trueflight.models.contract import REQUEST_BYTES, too_large
+from trueflight.models.errors import InputError
+from trueflight.models.pose import pose_from_json
+from trueflight.models.reference import LONGEST, MOST_ROWS, trajectory_from_csv
 
 HUGE = 10**400
 
@@ -150,7 +150,7 @@ def test_no_packet_is_anything_but_a_pose_or_refused(name: str) -> None:
 
 
 def test_no_packet_ends_the_feed() -> None:
-    from companion.pose import PoseFeed, PoseSettings
+    from trueflight.companion.pose import PoseFeed, PoseSettings
 
     passed: list[object] = []
     told: list[str] = []

@@ -14,9 +14,9 @@ import pytest
 from rig import VEHICLE
 from test_companion_cli import companion, refused
 
-from companion.service import CONFIG, FOLDER, SYSUSERS, UNIT
-from companion.settings import Settings, load_settings
-from groundstation.operate.keys import make_keys
+from trueflight.companion.service import CONFIG, FOLDER, SYSUSERS, UNIT
+from trueflight.companion.settings import Settings, load_settings
+from trueflight.groundstation.operate.keys import make_keys
 
 
 def install(root: Path, *flags: object) -> dict[str, str]:

@@ -10,15 +10,15 @@ import pytest
 from rig import VEHICLE, free_port
 from test_companion_cli import refused
 
-from companion.access import access_findings
-from companion.findings import DANGER, FAIL, NOTE, OK
-from companion.settings import Settings, load_settings
-from companion.zenoh_session import LOCAL, WITH_KEYS, ZenohSettings, open_session, plan_session
-from groundstation.operate.keys import make_keys
-from groundstation.operate.link import Link
-from groundstation.operate.settings import Settings as GroundSettings
-from models.access import Keys, read_keys
-from models.errors import InputError
+from trueflight.companion.access import access_findings
+from trueflight.companion.findings import DANGER, FAIL, NOTE, OK
+from trueflight.companion.settings import Settings, load_settings
+from trueflight.companion.zenoh_session import LOCAL, WITH_KEYS, ZenohSettings, open_session, plan_session
+from trueflight.groundstation.operate.keys import make_keys
+from trueflight.groundstation.operate.link import Link
+from trueflight.groundstation.operate.settings import Settings as GroundSettings
+from trueflight.models.access import Keys, read_keys
+from trueflight.models.errors import InputError
 
 
 @pytest.fixture(scope="module")

@@ -9,16 +9,16 @@ import pytest
 from onnx_models import drag_model
 from rig import VEHICLE, Bridge, Process, free_port, wait_for
 
-from companion.signature import Signatures
-from companion.store import ModelStore
-from groundstation.operate.keys import make_keys
-from groundstation.operate.link import Link
-from groundstation.operate.settings import Settings
-from models.access import SIGNING_KEY, read_keys
-from models.contract import model_hash
-from models.errors import InputError
-from models.signature import read_signature, sign
-from models.vehicle import load_vehicle
+from trueflight.companion.signature import Signatures
+from trueflight.companion.store import ModelStore
+from trueflight.groundstation.operate.keys import make_keys
+from trueflight.groundstation.operate.link import Link
+from trueflight.groundstation.operate.settings import Settings
+from trueflight.models.access import SIGNING_KEY, read_keys
+from trueflight.models.contract import model_hash
+from trueflight.models.errors import InputError
+from trueflight.models.signature import read_signature, sign
+from trueflight.models.vehicle import load_vehicle
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def test_a_companion_with_keys_is_read_flown_and_given_models_by_role(root: Path
 
 def _run(folder: Path, mavlink: int, port: int, flags: tuple[str, ...]) -> Process:
     """A companion process without the rig's own session, which has no keys."""
-    program = "from companion.cli import main; main()"
+    program = "from trueflight.companion.cli import main; main()"
     companion = Process(
         ["-c", program, "run", "--vehicle", str(VEHICLE), "--connect", f"udpin://127.0.0.1:{mavlink}"]
         + ["--records", str(folder / "records"), "--models", str(folder / "models")]

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 from rig import Bridge, Companion, Wiretap, wait_for
 
-from models.record import read_record
+from trueflight.models.record import read_record
 
 LOSS_TIME = 1.0  # s: COM_OF_LOSS_T, as the bridge and PX4 have it by default
 
 HANGS = """
 import signal, time
-from companion.control import ControlLaw
+from trueflight.companion.control import ControlLaw
 hung = []
 signal.signal(signal.SIGUSR1, lambda *_: hung.append({kind!r}))
 step = ControlLaw.step

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.guard import Guard
-from companion.shadow import Shadow, ShadowLimits, error_acceleration
-from companion.watch import GuardLimits, Range, Watch
-from models import frames
+from trueflight.companion.guard import Guard
+from trueflight.companion.shadow import Shadow, ShadowLimits, error_acceleration
+from trueflight.companion.watch import GuardLimits, Range, Watch
+from trueflight.models import frames
 
 LIMITS = GuardLimits(fade=0.5)
 RANGES = (Range("z", "m", 0.0, 2.0), Range("vx", "m/s", -2.0, 2.0))

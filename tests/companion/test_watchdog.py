@@ -15,7 +15,7 @@ import pytest
 from rig import Bridge, Companion, free_port, wait_for
 from test_silence import HANGS
 
-from companion.watchdog import Watchdog, raise_priority
+from trueflight.companion.watchdog import Watchdog, raise_priority
 
 
 class Manager:

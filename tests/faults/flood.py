@@ -20,7 +20,7 @@ from collections.abc import Callable
 import zenoh
 from pymavlink.dialects.v20 import common as mav
 
-from models import contract
+from trueflight.models import contract
 
 PUBLISHED = ("pose", "tick", "event")
 ASKED = ("status", "mission", "model", "record")

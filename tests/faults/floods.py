@@ -23,10 +23,10 @@ from promise import Row, spread
 from rig import Companion
 from scene import Scene
 
-from models import contract
-from models.errors import InputError
-from models.pose import Pose, pose_to_json
-from models.record import FlightRecord, read_record
+from trueflight.models import contract
+from trueflight.models.errors import InputError
+from trueflight.models.pose import Pose, pose_to_json
+from trueflight.models.record import FlightRecord, read_record
 
 GAP = 0.25
 """s without a setpoint that no flood may make: half of `scene.LOSS_TIME`."""

@@ -21,15 +21,15 @@ from typing import Any
 import zenoh
 from network_stage import HEARD, ORDER, PEOPLE, Open, Stage, free_port, tls, vehicle
 
-from companion.zenoh_session import ZenohSettings, open_session
-from groundstation.operate.keys import make_keys
-from groundstation.operate.link import Link, companions
-from groundstation.operate.settings import Settings
-from models import access
-from models.access import NEEDS, may, read_keys
-from models.contract import key, model_hash
-from models.errors import InputError
-from models.signature import Signature, sign
+from trueflight.companion.zenoh_session import ZenohSettings, open_session
+from trueflight.groundstation.operate.keys import make_keys
+from trueflight.groundstation.operate.link import Link, companions
+from trueflight.groundstation.operate.settings import Settings
+from trueflight.models import access
+from trueflight.models.access import NEEDS, may, read_keys
+from trueflight.models.contract import key, model_hash
+from trueflight.models.errors import InputError
+from trueflight.models.signature import Signature, sign
 
 
 @dataclass(frozen=True)

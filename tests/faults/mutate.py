@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from damage import damaged
 from readers import Reader, readers
 
-from models.errors import InputError
+from trueflight.models.errors import InputError
 
 SECONDS = 10.0
 """Processor time of one file; the slowest whole one takes below 1 s here."""

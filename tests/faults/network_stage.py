@@ -11,14 +11,14 @@ from typing import Any
 
 import zenoh
 
-from companion.signature import Signatures
-from companion.telemetry import ATTACHED, Telemetry, read_json
-from companion.zenoh_session import ZenohSettings, open_session
-from groundstation.operate.keys import make_keys
-from groundstation.operate.link import Link
-from groundstation.operate.settings import Settings
-from models import access
-from models.access import Keys, read_keys
+from trueflight.companion.signature import Signatures
+from trueflight.companion.telemetry import ATTACHED, Telemetry, read_json
+from trueflight.companion.zenoh_session import ZenohSettings, open_session
+from trueflight.groundstation.operate.keys import make_keys
+from trueflight.groundstation.operate.link import Link
+from trueflight.groundstation.operate.settings import Settings
+from trueflight.models import access
+from trueflight.models.access import Keys, read_keys
 
 PEOPLE = [("eve", "observer"), ("anna", "operator"), ("bob", "engineer"), ("carl", "engineer")]
 ORDER = {

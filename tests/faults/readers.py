@@ -24,29 +24,29 @@ sys.path.insert(0, str(ROOT / "tests" / "groundstation"))
 
 from ulog_writer import TYPES, Written
 
-from companion.settings import load_settings as companion_settings
-from companion.store import live_file
-from groundstation.commands.survey import _already
-from groundstation.operate.settings import load_settings as ground_settings
-from groundstation.reading import read_flight
-from groundstation.reading.mapping import load_mapping
-from groundstation.reading.px4_log import load_ulog
-from groundstation.study.calibration_study import Study
-from groundstation.study.reproduce import _told
-from groundstation.versions.store import find, newest, save, versions
-from groundstation.versions.vehicle_draft import draft_vehicle
-from models.database import Collection
-from models.design import load_design
-from models.errors import InputError
-from models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd
-from models.model import Model, Term, read_model
-from models.network import Network
-from models.outside import unreadable
-from models.record import EVENT_TOPIC, TICK_TOPIC, FlightRecorder, read_record, vehicle_to_toml
-from models.record_pb2 import DESCRIPTOR, Event, Tick
-from models.vehicle import Vehicle, load_vehicle
-from sim_bridge.seal import reveal, seal
-from sim_bridge.settings import load_settings as bridge_settings
+from trueflight.companion.settings import load_settings as companion_settings
+from trueflight.companion.store import live_file
+from trueflight.groundstation.commands.survey import _already
+from trueflight.groundstation.operate.settings import load_settings as ground_settings
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.reading.mapping import load_mapping
+from trueflight.groundstation.reading.px4_log import load_ulog
+from trueflight.groundstation.study.calibration_study import Study
+from trueflight.groundstation.study.reproduce import _told
+from trueflight.groundstation.versions.store import find, newest, save, versions
+from trueflight.groundstation.versions.vehicle_draft import draft_vehicle
+from trueflight.models.database import Collection
+from trueflight.models.design import load_design
+from trueflight.models.errors import InputError
+from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd
+from trueflight.models.model import Model, Term, read_model
+from trueflight.models.network import Network
+from trueflight.models.outside import unreadable
+from trueflight.models.record import EVENT_TOPIC, TICK_TOPIC, FlightRecorder, read_record, vehicle_to_toml
+from trueflight.models.record_pb2 import DESCRIPTOR, Event, Tick
+from trueflight.models.vehicle import Vehicle, load_vehicle
+from trueflight.sim_bridge.seal import reveal, seal
+from trueflight.sim_bridge.settings import load_settings as bridge_settings
 
 QUAD5 = ROOT / "models" / "vehicles" / "quad5"
 CRAZYFLIE = ROOT / "samples" / "crazyflie"
@@ -115,12 +115,12 @@ def readers(folder: Path) -> tuple[Reader, ...]:
         replace(STUDY, folder=folder / "study").open()
 
     def setpoints(path: Path) -> None:
-        from models.reference import trajectory_from_csv
+        from trueflight.models.reference import trajectory_from_csv
 
         trajectory_from_csv(path.read_bytes().decode("utf-8", "replace"), str(path))
 
     def pose(path: Path) -> None:
-        from models.pose import pose_from_json
+        from trueflight.models.pose import pose_from_json
 
         try:
             pose_from_json(path.read_bytes())

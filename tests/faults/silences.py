@@ -19,9 +19,9 @@ from promise import Row, spread
 from rig import wait_for
 from scene import FOREVER, Scene
 
-from models import contract
-from models.errors import InputError
-from models.record import read_record
+from trueflight.models import contract
+from trueflight.models.errors import InputError
+from trueflight.models.record import read_record
 
 GOAL = 0.05
 """s after which no setpoint may leave any more."""
@@ -30,7 +30,7 @@ HANG = 2.0
 
 HANGS = f"""
 import signal, time
-from companion.control import ControlLaw
+from trueflight.companion.control import ControlLaw
 hangs = []
 signal.signal(signal.SIGUSR1, lambda *_: hangs.append(0.1))
 signal.signal(signal.SIGUSR2, lambda *_: hangs.append(0.0))

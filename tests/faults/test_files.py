@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from readers import QUAD5, Reader, readers
 
-from groundstation.versions.store import newest, save
-from models.errors import InputError
-from models.model import Term, rigid_body_model
-from models.outside import json_object, toml_table
-from models.vehicle import load_vehicle
+from trueflight.groundstation.versions.store import newest, save
+from trueflight.models.errors import InputError
+from trueflight.models.model import Term, rigid_body_model
+from trueflight.models.outside import json_object, toml_table
+from trueflight.models.vehicle import load_vehicle
 
 HERE, BIN = Path(__file__).parent, Path(sys.executable).parent
 
@@ -183,8 +183,8 @@ def _alive(pid: int) -> bool:
 @pytest.mark.parametrize("left", ["", '{"seed": 1, "scen', "[1]"])
 def test_a_reproduction_goes_on_after_a_kill(left: str, tmp_path: Path) -> None:
     """An older version left half a file; this one a hidden one, or a record that nothing was told of yet."""
-    from groundstation.commands.reproduce import _same_study
-    from groundstation.study.reproduce import Flown, _kept
+    from trueflight.groundstation.commands.reproduce import _same_study
+    from trueflight.groundstation.study.reproduce import Flown, _kept
 
     flown = Flown(1, "unseen", "lqr", (1.0, 2.0, 3.0), "finished", "")
     (tmp_path / "study.json").write_text("")

@@ -17,7 +17,7 @@ from conftest import Link
 from mitm import TIMESYNC, Fault, delayed, frozen, lost, nothing, reset, without
 from rig import wait_for
 
-from models.record import read_record
+from trueflight.models.record import read_record
 
 INJECT = Path(__file__).with_name("inject.py")
 LATEST = 0.3

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from rig import SET_ATTITUDE_TARGET, Bridge, Companion, Wiretap, wait_for
 
-from models import contract
-from models.record import read_record
+from trueflight.models import contract
+from trueflight.models.record import read_record
 
 SPEED = "2"
 OFFBOARD_LOSS = 1.0

@@ -27,23 +27,23 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from readers import QUAD5, _columns
 
-from groundstation.evaluate.survey import write_table
-from groundstation.reading import read_flight
-from groundstation.reading.writing import write_flight
-from groundstation.report.page import write_report
-from groundstation.study.calibration_study import _write as write_study
-from groundstation.versions.effect_file import write_effect_file
-from groundstation.versions.store import newest, save, versions
-from models.database import Collection
-from models.design import load_design, save_design
-from models.errors import InputError
-from models.model import Term, read_model, rigid_body_model
-from models.record import read_record
-from models.reference import trajectory
-from models.vehicle import load_vehicle
-from models.whole_file import write_whole
-from sim_bridge.in_process import Plan, record
-from sim_bridge.seal import reveal, seal
+from trueflight.groundstation.evaluate.survey import write_table
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.reading.writing import write_flight
+from trueflight.groundstation.report.page import write_report
+from trueflight.groundstation.study.calibration_study import _write as write_study
+from trueflight.groundstation.versions.effect_file import write_effect_file
+from trueflight.groundstation.versions.store import newest, save, versions
+from trueflight.models.database import Collection
+from trueflight.models.design import load_design, save_design
+from trueflight.models.errors import InputError
+from trueflight.models.model import Term, read_model, rigid_body_model
+from trueflight.models.record import read_record
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import load_vehicle
+from trueflight.models.whole_file import write_whole
+from trueflight.sim_bridge.in_process import Plan, record
+from trueflight.sim_bridge.seal import reveal, seal
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def writers(flight_file: Path) -> tuple[Writer, ...]:
         newest(folder, vehicle)
 
     def view(folder: Path) -> None:
-        from groundstation.views.recording import recording, text
+        from trueflight.groundstation.views.recording import recording, text
 
         with recording(folder / "view.rrd", "view", "one") as stream:
             text(stream, "note", "word " * 20000)

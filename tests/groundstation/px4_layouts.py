@@ -10,8 +10,8 @@ import numpy as np
 from simulated import simulated
 from ulog_writer import Written
 
-from models.flight import Flight
-from models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd
+from trueflight.models.flight import Flight
+from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd
 
 BOOT = 20.0  # s on PX4's clock when the log starts
 GROUND, CLIMB = 3.0, 3.0  # s before and after the flight
@@ -205,7 +205,7 @@ def _position(log: Written, one: Flown, number: tuple[int, ...]) -> None:
 
 
 def _odometry(log: Written, one: Flown, number: tuple[int, ...], body: bool = False) -> None:
-    from models.frames import rotate_inverse
+    from trueflight.models.frames import rotate_inverse
 
     rows = one.rows(50)
     position = ned(one.position[rows])

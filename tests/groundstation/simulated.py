@@ -4,15 +4,15 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from groundstation.reading import read_flight
-from models.design import load_design
-from models.flight import Flight
-from models.reference import trajectory
-from models.trajectory import Trajectory
-from models.vehicle import load_vehicle
-from sim_bridge.in_process import Plan, record
-from sim_bridge.truth.hidden import choose
-from sim_bridge.truth.sensors import Noise
+from trueflight.groundstation.reading import read_flight
+from trueflight.models.design import load_design
+from trueflight.models.flight import Flight
+from trueflight.models.reference import trajectory
+from trueflight.models.trajectory import Trajectory
+from trueflight.models.vehicle import load_vehicle
+from trueflight.sim_bridge.in_process import Plan, record
+from trueflight.sim_bridge.truth.hidden import choose
+from trueflight.sim_bridge.truth.sensors import Noise
 
 VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
 

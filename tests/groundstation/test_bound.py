@@ -12,16 +12,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from groundstation.commands.app import app
-from groundstation.design.linear_design import make_design
-from groundstation.design.linear_response import Reference, expected_behaviour
-from groundstation.evaluate.bound import balls_of, jumps_of, memory, predict_tube, smallest_ball, tube
-from groundstation.evaluate.tracking import read_designed
-from models.design import load_design
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import quaternion_from_euler, rotate_inverse
-from models.vehicle import GRAVITY, load_vehicle
+from trueflight.groundstation.commands.app import app
+from trueflight.groundstation.design.linear_design import make_design
+from trueflight.groundstation.design.linear_response import Reference, expected_behaviour
+from trueflight.groundstation.evaluate.bound import (
+    balls_of,
+    jumps_of,
+    memory,
+    predict_tube,
+    smallest_ball,
+    tube,
+)
+from trueflight.groundstation.evaluate.tracking import read_designed
+from trueflight.models.design import load_design
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import quaternion_from_euler, rotate_inverse
+from trueflight.models.vehicle import GRAVITY, load_vehicle
 
 QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5"
 VEHICLE = load_vehicle(QUAD5 / "vehicle.toml")

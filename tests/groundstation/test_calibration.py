@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from simulated import VEHICLE
 
-from groundstation.commands.app import app
-from groundstation.evaluate.calibration import (
+from trueflight.groundstation.commands.app import app
+from trueflight.groundstation.evaluate.calibration import (
     ABSENT,
     MISSING,
     NOT_EXCITED,
@@ -28,13 +28,13 @@ from groundstation.evaluate.calibration import (
     reliability,
     wrongs,
 )
-from groundstation.output.as_json import calibration_table
-from groundstation.report.calibration import CHARTS, render_calibration
-from groundstation.study.calibration_study import TOP, Study, hideable, path_of, setpoints, sorties
-from models.effects import catalogue
-from models.errors import run_command_line
-from models.reference import trajectory_from_csv
-from models.vehicle import load_vehicle
+from trueflight.groundstation.output.as_json import calibration_table
+from trueflight.groundstation.report.calibration import CHARTS, render_calibration
+from trueflight.groundstation.study.calibration_study import TOP, Study, hideable, path_of, setpoints, sorties
+from trueflight.models.effects import catalogue
+from trueflight.models.errors import run_command_line
+from trueflight.models.reference import trajectory_from_csv
+from trueflight.models.vehicle import load_vehicle
 
 NAMES = ("thrust_gain", "rotor_drag", "wind", "ceiling_effect", "vortex_ring", "com_offset")
 

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from companion.telemetry import Telemetry, read_json
-from companion.zenoh_session import ZenohSettings, open_session
-from groundstation.commands.app import app
-from models.database import database
-from models.errors import run_command_line
-from models.record import read_record
+from trueflight.companion.telemetry import Telemetry, read_json
+from trueflight.companion.zenoh_session import ZenohSettings, open_session
+from trueflight.groundstation.commands.app import app
+from trueflight.models.database import database
+from trueflight.models.errors import run_command_line
+from trueflight.models.record import read_record
 
 ROOT = Path(__file__).parents[2]
 QUAD5 = ROOT / "models" / "vehicles" / "quad5" / "vehicle.toml"

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.identify.translation import diagnose
-from groundstation.reading import read_flight
-from groundstation.results import Diagnosis
-from models.model import Term, rigid_body_model
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.results import Diagnosis
+from trueflight.models.model import Term, rigid_body_model
 
 ROOT = Path(__file__).parents[2]
 SAMPLES = ROOT / "samples"

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from groundstation.evaluate.compare import compare
-from groundstation.evaluate.where import where_it_fails
-from groundstation.identify.fitting import Problem, critical_value, fit
-from groundstation.measured.measurement import measure
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import quaternion_from_euler
-from models.model import Term, rigid_body_model
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.groundstation.evaluate.compare import compare
+from trueflight.groundstation.evaluate.where import where_it_fails
+from trueflight.groundstation.identify.fitting import Problem, critical_value, fit
+from trueflight.groundstation.measured.measurement import measure
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import quaternion_from_euler
+from trueflight.models.model import Term, rigid_body_model
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 VEHICLE = Vehicle(name="test", mass=1.0, hover_thrust=0.5, rotor_radius=0.1)
 DRAG = 0.25
@@ -39,8 +39,8 @@ def flight(seed: int, colour: float, seconds: float = 30.0, noise: float = 0.15)
         specific_force=coloured,
         thrust_command=0.5 * thrust / GRAVITY,
     )
-    from models.effects import effect_named
-    from models.prediction import act, motion_of_flight, specific_force
+    from trueflight.models.effects import effect_named
+    from trueflight.models.prediction import act, motion_of_flight, specific_force
 
     chain = [(effect_named("rigid_body"), {}), (effect_named("rotor_drag"), {"x": DRAG, "y": DRAG})]
     truth = specific_force(act(motion_of_flight(made), chain))
@@ -73,7 +73,7 @@ def test_noise_floor_is_the_noise_behind_the_filter() -> None:
 
 def test_acceleration_from_velocity_has_the_same_filter_on_both_sides() -> None:
     made = flight(4, 0.0, noise=1e-3)
-    from models.frames import rotate
+    from trueflight.models.frames import rotate
 
     world = rotate(made.quaternion, made.specific_force) - [0.0, 0.0, GRAVITY]
     velocity = np.cumsum(world, axis=0) * made.dt
@@ -108,7 +108,7 @@ def test_where_it_fails_names_the_region_that_was_made_bad() -> None:
 def test_open_loop_error_falls_with_the_right_model() -> None:
     made = flight(6, 0.0)
     # a trajectory that obeys the model: velocity and position are integrals of its acceleration
-    from models.frames import rotate
+    from trueflight.models.frames import rotate
 
     acceleration = rotate(made.quaternion, made.specific_force) - [0.0, 0.0, GRAVITY]
     acceleration -= acceleration.mean(axis=0)

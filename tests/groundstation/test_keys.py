@@ -11,10 +11,10 @@ import pytest
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from groundstation.commands.app import app
-from groundstation.operate.keys import make_keys
-from models.access import may, read_keys
-from models.errors import InputError, run_command_line
+from trueflight.groundstation.commands.app import app
+from trueflight.groundstation.operate.keys import make_keys
+from trueflight.models.access import may, read_keys
+from trueflight.models.errors import InputError, run_command_line
 
 
 def run(capsys, *arguments):

@@ -12,16 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from groundstation.commands.app import app
-from groundstation.design.integral_design import integral_loops, with_integral
-from groundstation.design.linear_design import PHASE_MARGIN, loops, make_design
-from groundstation.design.linear_response import Reference, closed_loop, expected_behaviour
-from groundstation.evaluate.tracking import track
-from models.design import design_to_json, load_design
-from models.errors import InputError, run_command_line
-from models.flight import Flight
-from models.frames import heading_from_world, quaternion_from_euler
-from models.vehicle import GRAVITY, load_vehicle
+from trueflight.groundstation.commands.app import app
+from trueflight.groundstation.design.integral_design import integral_loops, with_integral
+from trueflight.groundstation.design.linear_design import PHASE_MARGIN, loops, make_design
+from trueflight.groundstation.design.linear_response import Reference, closed_loop, expected_behaviour
+from trueflight.groundstation.evaluate.tracking import track
+from trueflight.models.design import design_to_json, load_design
+from trueflight.models.errors import InputError, run_command_line
+from trueflight.models.flight import Flight
+from trueflight.models.frames import heading_from_world, quaternion_from_euler
+from trueflight.models.vehicle import GRAVITY, load_vehicle
 
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
 BIN = Path(sys.executable).parent
@@ -130,7 +130,14 @@ def test_the_integral_keeps_bandwidth_and_margin_of_the_lqr(design):
 
 def test_no_other_integral_that_does_as_much_is_nearer_to_the_lqr(design):
     """Against others around it: none that is as fast, with bandwidth and margin kept, comes nearer."""
-    from groundstation.design.integral_design import REMAINDER, STEP, _axes, _best, _crossover, _responses
+    from trueflight.groundstation.design.integral_design import (
+        REMAINDER,
+        STEP,
+        _axes,
+        _best,
+        _crossover,
+        _responses,
+    )
 
     rng = np.random.default_rng(0)
     for axis in _axes(design, VEHICLE):
@@ -332,7 +339,7 @@ def test_tracking_tells_a_flight_with_drag_from_one_without(records, capsys):
 
 
 def test_the_default_design_flies_in_the_simulator_with_its_delays(records):
-    from groundstation.reading import read_flight
+    from trueflight.groundstation.reading import read_flight
 
     flight = read_flight(records / "none.mcap")
     mission = flight.extra["mission"] > 0.5

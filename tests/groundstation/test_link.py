@@ -15,14 +15,14 @@ from pathlib import Path
 
 import pytest
 
-from companion.telemetry import PIECE, Telemetry, make_event, read_json
-from companion.zenoh_session import ZenohSettings, open_session
-from groundstation.commands.app import app
-from groundstation.commands.pilot import warn
-from groundstation.operate.link import Link, companions
-from groundstation.operate.settings import Settings, load_settings
-from models.errors import InputError, run_command_line
-from models.record_pb2 import Tick
+from trueflight.companion.telemetry import PIECE, Telemetry, make_event, read_json
+from trueflight.companion.zenoh_session import ZenohSettings, open_session
+from trueflight.groundstation.commands.app import app
+from trueflight.groundstation.commands.pilot import warn
+from trueflight.groundstation.operate.link import Link, companions
+from trueflight.groundstation.operate.settings import Settings, load_settings
+from trueflight.models.errors import InputError, run_command_line
+from trueflight.models.record_pb2 import Tick
 
 ROOT = Path(__file__).parents[2]
 QUAD5 = ROOT / "models" / "vehicles" / "quad5" / "vehicle.toml"
@@ -274,7 +274,7 @@ def test_a_flight_is_asked_for_watched_fetched_and_tracked(processes, endpoint, 
 
 
 def test_what_is_open_to_anybody_is_told_in_red(endpoint, tmp_path, capsys):
-    from groundstation.views.monitor import state
+    from trueflight.groundstation.views.monitor import state
 
     status = {
         "accepted": True,

@@ -9,17 +9,17 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from groundstation.evaluate.compare import waterfall
-from groundstation.reading import read_flight
-from groundstation.versions.store import add_effect, find, lineage, save
-from models import contract
-from models.effect import Stage
-from models.effects import catalogue
-from models.errors import InputError
-from models.export import export_onnx, not_exported
-from models.features import feature_matrix, feature_names, features_of_flight
-from models.model import Term, read_model, rigid_body_model, write_model
-from models.prediction import error_acceleration, motion_of_features
+from trueflight.groundstation.evaluate.compare import waterfall
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.versions.store import add_effect, find, lineage, save
+from trueflight.models import contract
+from trueflight.models.effect import Stage
+from trueflight.models.effects import catalogue
+from trueflight.models.errors import InputError
+from trueflight.models.export import export_onnx, not_exported
+from trueflight.models.features import feature_matrix, feature_names, features_of_flight
+from trueflight.models.model import Term, read_model, rigid_body_model, write_model
+from trueflight.models.prediction import error_acceleration, motion_of_features
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 DRAG = SAMPLES / "rotorpy" / "rotor_drag"

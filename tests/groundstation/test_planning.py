@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from simulated import VEHICLE, fly
 
-from groundstation.identify.planning import Limits, plan_flight, setpoints
-from groundstation.identify.translation import diagnose
-from groundstation.reading import read_flight
-from models.design import load_design
-from models.errors import InputError
-from models.model import rigid_body_model
-from models.reference import trajectory, trajectory_from_csv
-from models.vehicle import load_vehicle
+from trueflight.groundstation.identify.planning import Limits, plan_flight, setpoints
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.reading import read_flight
+from trueflight.models.design import load_design
+from trueflight.models.errors import InputError
+from trueflight.models.model import rigid_body_model
+from trueflight.models.reference import trajectory, trajectory_from_csv
+from trueflight.models.vehicle import load_vehicle
 
 BELIEVED = load_vehicle(VEHICLE)
 DESIGN = load_design(VEHICLE.with_name("design.json"), BELIEVED)

@@ -6,10 +6,10 @@ import pytest
 from px4_layouts import BOOT, RELEASES, flown, log_of, middle_of, motors, still_later
 from ulog_writer import Written
 
-from groundstation.reading import read_flight, segments
-from groundstation.reading.px4_log import load_ulog
-from models.errors import InputError
-from models.vehicle import Vehicle
+from trueflight.groundstation.reading import read_flight, segments
+from trueflight.groundstation.reading.px4_log import load_ulog
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle
 
 VEHICLE = Vehicle("quad5", mass=0.75, hover_thrust=0.38)
 THRUST_TOPICS = (

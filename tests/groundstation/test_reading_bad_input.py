@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.commands.app import app
-from groundstation.reading import read_flight
-from groundstation.reading.writing import own_table
-from models.errors import run_command_line
+from trueflight.groundstation.commands.app import app
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.reading.writing import own_table
+from trueflight.models.errors import run_command_line
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 DRAG = SAMPLES / "rotorpy" / "rotor_drag"

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from simulated import simulated
 
-from groundstation.reading import read_flight, segments
-from groundstation.reading.writing import own_table
-from models.errors import InputError
-from models.vehicle import Vehicle
+from trueflight.groundstation.reading import read_flight, segments
+from trueflight.groundstation.reading.writing import own_table
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle
 
 VEHICLE = Vehicle("quad5", mass=0.75, hover_thrust=0.38)
 

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from groundstation.reading import read_flight, segments
-from groundstation.reading.mapping import UNITS
-from groundstation.reading.writing import own_table, write_flight
-from models.flight import COLUMNS
-from models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, rotate, rotate_inverse
-from models.vehicle import GRAVITY, load_vehicle
+from trueflight.groundstation.reading import read_flight, segments
+from trueflight.groundstation.reading.mapping import UNITS
+from trueflight.groundstation.reading.writing import own_table, write_flight
+from trueflight.models.flight import COLUMNS
+from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, rotate, rotate_inverse
+from trueflight.models.vehicle import GRAVITY, load_vehicle
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 DRAG = SAMPLES / "rotorpy" / "rotor_drag"
@@ -171,7 +171,7 @@ def test_every_unit_is_undone_by_its_own_scale(value, unit):
 
 
 def test_roll_pitch_yaw_columns_are_an_attitude(flight, tmp_path):
-    from models.frames import euler_from_quaternion
+    from trueflight.models.frames import euler_from_quaternion
 
     roll, pitch, yaw = np.degrees(euler_from_quaternion(flight.quaternion)).T
     columns = own_table(flight)

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.reading import read_flight, segments
-from models.errors import InputError
-from models.frames import rotate, rotate_inverse
-from models.vehicle import GRAVITY, load_vehicle
+from trueflight.groundstation.reading import read_flight, segments
+from trueflight.models.errors import InputError
+from trueflight.models.frames import rotate, rotate_inverse
+from trueflight.models.vehicle import GRAVITY, load_vehicle
 
 ROOT = Path(__file__).parents[2]
 ULOG = ROOT / "samples" / "px4" / "sih_lemniscate.ulg"
@@ -89,7 +89,7 @@ def test_a_ulog_shows_the_simulators_own_mass_and_drag(ulog):
 
 
 def test_body_rates_of_a_ulog_turn_the_attitude(ulog):
-    from groundstation.reading.plausible import body_rate
+    from trueflight.groundstation.reading.plausible import body_rate
 
     rows = np.flatnonzero(ulog.flying)[:-5]
     turned = body_rate(ulog.quaternion[rows], ulog.quaternion[rows + 4], 0.04)

@@ -12,23 +12,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.identify.fitting import Problem, fit
-from groundstation.identify.rotors import thrust_from_rotors
-from groundstation.identify.translation import diagnose
-from groundstation.measured.measurement import measure
-from groundstation.reading import read_flight
-from groundstation.results import Diagnosis, EffectVerdict
-from models.design import load_design
-from models.effects import catalogue, effect_named
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import quaternion_from_euler
-from models.model import Term, rigid_body_model
-from models.prediction import act, motion_of_flight, specific_force
-from models.reference import trajectory
-from models.vehicle import GRAVITY, Vehicle, load_vehicle
-from sim_bridge.in_process import Plan, record
-from sim_bridge.truth.hidden import EFFECTS, Hidden, choose
+from trueflight.groundstation.identify.fitting import Problem, fit
+from trueflight.groundstation.identify.rotors import thrust_from_rotors
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.measured.measurement import measure
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.results import Diagnosis, EffectVerdict
+from trueflight.models.design import load_design
+from trueflight.models.effects import catalogue, effect_named
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import quaternion_from_euler
+from trueflight.models.model import Term, rigid_body_model
+from trueflight.models.prediction import act, motion_of_flight, specific_force
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import GRAVITY, Vehicle, load_vehicle
+from trueflight.sim_bridge.in_process import Plan, record
+from trueflight.sim_bridge.truth.hidden import EFFECTS, Hidden, choose
 
 FOLDER = Path(__file__).parents[2] / "models" / "vehicles" / "quad5"
 

@@ -7,19 +7,19 @@ import pytest
 from scipy import signal
 from simulated import simulated
 
-from groundstation.identify.fitting import Problem, fit
-from groundstation.identify.remainder import unexplained
-from groundstation.identify.sparse import TERMS, effect_source, unit_of
-from groundstation.identify.translation import diagnose
-from groundstation.measured.measurement import measure
-from groundstation.results import Unexplained
-from groundstation.versions.effect_file import write_effect_file
-from groundstation.versions.store import add_effect
-from models.effects import effect_named
-from models.errors import InputError
-from models.flight import Flight
-from models.frames import rotate_inverse
-from models.model import Term, rigid_body_model
+from trueflight.groundstation.identify.fitting import Problem, fit
+from trueflight.groundstation.identify.remainder import unexplained
+from trueflight.groundstation.identify.sparse import TERMS, effect_source, unit_of
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.measured.measurement import measure
+from trueflight.groundstation.results import Unexplained
+from trueflight.groundstation.versions.effect_file import write_effect_file
+from trueflight.groundstation.versions.store import add_effect
+from trueflight.models.effects import effect_named
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import rotate_inverse
+from trueflight.models.model import Term, rigid_body_model
 
 
 def remainder(flight: Flight) -> Unexplained:

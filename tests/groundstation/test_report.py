@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.evaluate.analysis import analyse
-from groundstation.evaluate.side_by_side import side_by_side, told_apart
-from groundstation.output.as_json import analysis_table
-from groundstation.output.cited import Told, environment, sentences, written
-from groundstation.reading import read_flight
-from groundstation.report import SECTIONS, chosen, render, write_report
-from groundstation.views import write_analysis
-from models.errors import InputError
-from models.model import linear_model, rigid_body_model
+from trueflight.groundstation.evaluate.analysis import analyse
+from trueflight.groundstation.evaluate.side_by_side import side_by_side, told_apart
+from trueflight.groundstation.output.as_json import analysis_table
+from trueflight.groundstation.output.cited import Told, environment, sentences, written
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.report import SECTIONS, chosen, render, write_report
+from trueflight.groundstation.views import write_analysis
+from trueflight.models.errors import InputError
+from trueflight.models.model import linear_model, rigid_body_model
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 BIN = Path(sys.executable).parent
@@ -265,7 +265,7 @@ def test_a_report_that_cannot_be_written_is_told(tmp_path):
 
 def run(*arguments, cwd):
     return subprocess.run(
-        [sys.executable, "-m", "groundstation.commands.app", *map(str, arguments)],
+        [sys.executable, "-m", "trueflight.groundstation.commands.app", *map(str, arguments)],
         cwd=cwd, capture_output=True, text=True, timeout=200,
     )  # fmt: skip
 

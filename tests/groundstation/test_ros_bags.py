@@ -12,10 +12,10 @@ from mcap_ros2.writer import Writer
 from px4_layouts import BOOT, flown, log_of, middle_of
 from ulog_writer import TYPES, Written
 
-from groundstation.reading import read_flight
-from models.errors import InputError
-from models.frames import rotate_inverse
-from models.vehicle import Vehicle
+from trueflight.groundstation.reading import read_flight
+from trueflight.models.errors import InputError
+from trueflight.models.frames import rotate_inverse
+from trueflight.models.vehicle import Vehicle
 
 VEHICLE = Vehicle("quad5", mass=0.75, hover_thrust=0.38)
 BIN = Path(sys.executable).parent

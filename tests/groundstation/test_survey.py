@@ -9,15 +9,22 @@ import pytest
 from pyarrow import parquet
 from simulated import VEHICLE
 
-from groundstation.commands.app import app
-from groundstation.evaluate.survey import Estimate, Row, fleet_of, flight_files, survey, survey_flight
-from models.design import load_design
-from models.errors import InputError, run_command_line
-from models.reference import trajectory
-from models.vehicle import load_vehicle
-from sim_bridge.in_process import Plan, record
-from sim_bridge.truth.hidden import choose
-from sim_bridge.truth.sensors import Noise
+from trueflight.groundstation.commands.app import app
+from trueflight.groundstation.evaluate.survey import (
+    Estimate,
+    Row,
+    fleet_of,
+    flight_files,
+    survey,
+    survey_flight,
+)
+from trueflight.models.design import load_design
+from trueflight.models.errors import InputError, run_command_line
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import load_vehicle
+from trueflight.sim_bridge.in_process import Plan, record
+from trueflight.sim_bridge.truth.hidden import choose
+from trueflight.sim_bridge.truth.sensors import Noise
 
 DRAG = {"one": 0.20, "two": 0.30}
 
@@ -81,7 +88,7 @@ def test_every_flight_is_a_row_and_a_bad_file_is_skipped(folder, tmp_path, capsy
     (tmp_path / "survey.jsonl").write_text("\n".join(lines[:-3]) + "\n" + lines[-3][:40])
     seen = []
     monkeypatch.setattr(
-        "groundstation.evaluate.survey.survey_flight",
+        "trueflight.groundstation.evaluate.survey.survey_flight",
         lambda file, *task: seen.append(file) or survey_flight(file, *task),
     )
     code, out, _ = run(capsys, monkeypatch, "survey", folder, "--save", tmp_path, "--jobs", 1)
@@ -93,7 +100,7 @@ def test_every_flight_is_a_row_and_a_bad_file_is_skipped(folder, tmp_path, capsy
 def test_a_worker_that_dies_costs_its_file_only(folder, tmp_path, monkeypatch) -> None:
     pytest.importorskip("distributed")
     files = flight_files(folder)[:4]
-    monkeypatch.setattr("groundstation.evaluate.survey.survey_flight", _dies_on_the_second)
+    monkeypatch.setattr("trueflight.groundstation.evaluate.survey.survey_flight", _dies_on_the_second)
     rows = list(survey(files, jobs=2))
     assert len(rows) == 4
     assert [r.file for r in rows if r.error] == [str(files[1].resolve())]

@@ -9,17 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundstation.commands.train import read_flights
-from groundstation.evaluate.compare import compare, waterfall
-from groundstation.identify.translation import diagnose
-from groundstation.learn.ablation import ablate, inference_time
-from groundstation.learn.training import MATERIAL_MEMORY, OWN, PAPER, memory_share, recipe_named, train
-from groundstation.learn.training_data import GAP, blocks, samples_of_flights, split
-from groundstation.reading import read_flight
-from groundstation.versions.store import add_effect, find, lineage, save
-from models.errors import InputError
-from models.export import export_onnx
-from models.model import linear_model, read_model, rigid_body_model
+from trueflight.groundstation.commands.train import read_flights
+from trueflight.groundstation.evaluate.compare import compare, waterfall
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.learn.ablation import ablate, inference_time
+from trueflight.groundstation.learn.training import (
+    MATERIAL_MEMORY,
+    OWN,
+    PAPER,
+    memory_share,
+    recipe_named,
+    train,
+)
+from trueflight.groundstation.learn.training_data import GAP, blocks, samples_of_flights, split
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.versions.store import add_effect, find, lineage, save
+from trueflight.models.errors import InputError
+from trueflight.models.export import export_onnx
+from trueflight.models.model import linear_model, read_model, rigid_body_model
 
 BIN = Path(sys.executable).parent
 VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"

@@ -10,11 +10,11 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from groundstation.commands.effect import write_template
-from groundstation.reading import read_flight
-from groundstation.reading.writing import write_flight
-from models.errors import InputError
-from models.frames import rotate_inverse
+from trueflight.groundstation.commands.effect import write_template
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.reading.writing import write_flight
+from trueflight.models.errors import InputError
+from trueflight.models.frames import rotate_inverse
 
 BIN = Path(sys.executable).parent
 SAMPLE = Path(__file__).parents[2] / "samples" / "rotorpy" / "nothing_hidden" / "identify.parquet"
@@ -33,7 +33,7 @@ def flight_with_tether(tmp_path_factory) -> Path:
 
 
 def run(*arguments: object) -> str:
-    command = [str(BIN / "python"), "-m", "groundstation.commands.app", *map(str, arguments)]
+    command = [str(BIN / "python"), "-m", "trueflight.groundstation.commands.app", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=180)
     assert done.returncode == 0, done.stderr
     return done.stdout

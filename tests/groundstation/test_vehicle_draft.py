@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from px4_layouts import flown, log_of
 
-from groundstation.reading import read_flight
-from groundstation.reading.px4_log import load_ulog
-from groundstation.versions.vehicle_draft import draft_vehicle, write_draft
-from models.errors import InputError
-from models.vehicle import load_vehicle
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.reading.px4_log import load_ulog
+from trueflight.groundstation.versions.vehicle_draft import draft_vehicle, write_draft
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import load_vehicle
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent

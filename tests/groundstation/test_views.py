@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from groundstation.evaluate.compare import compare, waterfall
-from groundstation.evaluate.tracking import Tracking
-from groundstation.evaluate.where import where_it_fails
-from groundstation.reading import read_flight
-from groundstation.results import WhereItFails
-from groundstation.versions.store import add_effect
-from groundstation.views import write_before_after, write_comparison, write_tracking, write_where
-from groundstation.views.colour import of_error
-from groundstation.views.error import rolling_rms
-from groundstation.views.monitor import Monitor, state
-from models.errors import InputError
-from models.model import linear_model, rigid_body_model
-from models.record_pb2 import Event, Tick
+from trueflight.groundstation.evaluate.compare import compare, waterfall
+from trueflight.groundstation.evaluate.tracking import Tracking
+from trueflight.groundstation.evaluate.where import where_it_fails
+from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.results import WhereItFails
+from trueflight.groundstation.versions.store import add_effect
+from trueflight.groundstation.views import write_before_after, write_comparison, write_tracking, write_where
+from trueflight.groundstation.views.colour import of_error
+from trueflight.groundstation.views.error import rolling_rms
+from trueflight.groundstation.views.monitor import Monitor, state
+from trueflight.models.errors import InputError
+from trueflight.models.model import linear_model, rigid_body_model
+from trueflight.models.record_pb2 import Event, Tick
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 RERUN = Path(sys.executable).parent / "rerun"

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.flight import Safety
-from models.database import EMPTIEST, FULLEST, Collection, database, record_name
-from models.errors import InputError
+from trueflight.companion.flight import Safety
+from trueflight.models.database import EMPTIEST, FULLEST, Collection, database, record_name
+from trueflight.models.errors import InputError
 
 
 @pytest.mark.parametrize("seed", range(4))

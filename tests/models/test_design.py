@@ -11,9 +11,9 @@ import control
 import numpy as np
 import pytest
 
-from models.design import design_to_json, hover_input_matrix, load_design, save_design
-from models.errors import InputError
-from models.vehicle import load_vehicle
+from trueflight.models.design import design_to_json, hover_input_matrix, load_design, save_design
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import load_vehicle
 
 QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5"
 

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.effect import Effect, Motion, Stage
-from models.effects import catalogue, effect_named
-from models.errors import InputError
-from models.flight import COLUMNS, Flight
-from models.frames import quaternion_from_euler
-from models.prediction import act, motion_of_flight, specific_force
-from models.vehicle import GRAVITY, Vehicle
+from trueflight.models.effect import Effect, Motion, Stage
+from trueflight.models.effects import catalogue, effect_named
+from trueflight.models.errors import InputError
+from trueflight.models.flight import COLUMNS, Flight
+from trueflight.models.frames import quaternion_from_euler
+from trueflight.models.prediction import act, motion_of_flight, specific_force
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 VEHICLE = Vehicle(
     name="test",
@@ -280,7 +280,7 @@ def test_gyroscopic_torque_is_the_change_of_the_rotors_momentum(rate, speeds, in
 
 
 def test_rate_loop_lag_is_a_first_order_response_after_a_delay() -> None:
-    from groundstation.identify.actuation import respond
+    from trueflight.groundstation.identify.actuation import respond
 
     dt, lag, delay = 0.002, 0.06, 0.03
     t = np.arange(300) * dt
@@ -372,7 +372,7 @@ def test_neutral_effect_changes_nothing(effect: Effect) -> None:
 
 def test_users_effect_is_one_file(tmp_path) -> None:
     (tmp_path / "tether.py").write_text(
-        "from models.effect import Effect, Motion, Parameter, Stage\n"
+        "from trueflight.models.effect import Effect, Motion, Parameter, Stage\n"
         "def formula(motion, *, pull):\n"
         "    'A constant pull along body x.'\n"
         "    return motion.with_(force=motion.force + pull * motion.rotation[:, 2, :] * 0.0 + pull)\n"

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from models import frames
+from trueflight.models import frames
 
 angle = st.floats(-3.1, 3.1)
 pitch = st.floats(-1.5, 1.5)

@@ -12,15 +12,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.inference import check_model
-from models import contract
-from models.errors import InputError
-from models.export import Correction, export_onnx, sequential
-from models.features import feature_matrix, features_of_flight
-from models.flight import Flight
-from models.frames import rotation_matrix
-from models.model import Term, linear_model, read_model, rigid_body_model, write_model
-from models.network import (
+from trueflight.companion.inference import check_model
+from trueflight.models import contract
+from trueflight.models.errors import InputError
+from trueflight.models.export import Correction, export_onnx, sequential
+from trueflight.models.features import feature_matrix, features_of_flight
+from trueflight.models.flight import Flight
+from trueflight.models.frames import rotation_matrix
+from trueflight.models.model import Term, linear_model, read_model, rigid_body_model, write_model
+from trueflight.models.network import (
     Network,
     error_acceleration_of,
     features_of_motion,
@@ -28,8 +28,8 @@ from models.network import (
     network_from_table,
     network_table,
 )
-from models.prediction import acceleration, act, error_acceleration, motion_of_flight
-from models.vehicle import load_vehicle
+from trueflight.models.prediction import acceleration, act, error_acceleration, motion_of_flight
+from trueflight.models.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
 NAMES = tuple(contract.FEATURES)

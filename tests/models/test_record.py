@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.design import Design
-from models.errors import InputError
-from models.flight import COLUMNS
-from models.record import FlightRecorder, read_record, vehicle_to_toml
-from models.record_pb2 import Event, Tick, Vector3
-from models.vehicle import Vehicle, load_vehicle
+from trueflight.models.design import Design
+from trueflight.models.errors import InputError
+from trueflight.models.flight import COLUMNS
+from trueflight.models.record import FlightRecorder, read_record, vehicle_to_toml
+from trueflight.models.record_pb2 import Event, Tick, Vector3
+from trueflight.models.vehicle import Vehicle, load_vehicle
 
 VEHICLE = Vehicle(
     name="quad5", mass=0.75, hover_thrust=0.38, rotor_positions=((0.1, 0.1, 0.0),), rotor_directions=(1,)
@@ -171,7 +171,7 @@ def test_a_killed_recorder_loses_at_most_a_second(tmp_path: Path) -> None:
         import sys, time
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from test_record import VEHICLE, make_tick
-        from models.record import FlightRecorder
+        from trueflight.models.record import FlightRecorder
         recorder = FlightRecorder({str(tmp_path / "a.mcap")!r}, VEHICLE)
         for i in range(100000):
             tick = make_tick(i)

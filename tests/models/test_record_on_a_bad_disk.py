@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from models import record
-from models.errors import InputError
-from models.record import FlightRecorder, read_record
-from models.record_pb2 import Tick
-from models.vehicle import load_vehicle
+from trueflight.models import record
+from trueflight.models.errors import InputError
+from trueflight.models.record import FlightRecorder, read_record
+from trueflight.models.record_pb2 import Tick
+from trueflight.models.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.errors import InputError
-from models.reference import KINDS, Trajectory, trajectory, trajectory_from_csv, transfer
+from trueflight.models.errors import InputError
+from trueflight.models.reference import KINDS, Trajectory, trajectory, trajectory_from_csv, transfer
 
 SMOOTH = sorted(name for name in KINDS if not name.startswith("step") and name != "scenario")
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from bridge_process import QUAD5, Bridge, free_ports
 
-from models.design import Design, load_design
-from models.vehicle import Vehicle, load_vehicle
+from trueflight.models.design import Design, load_design
+from trueflight.models.vehicle import Vehicle, load_vehicle
 
 
 @pytest.fixture(scope="session")
@@ -32,7 +32,7 @@ def bridge(tmp_path: Path) -> Iterator[Callable[..., Bridge]]:
         port, companion, pilot = free_ports(3)
         process = subprocess.Popen(
             [
-                *(sys.executable, "-c", "from sim_bridge.cli import main; main()", "run"),
+                *(sys.executable, "-c", "from trueflight.sim_bridge.cli import main; main()", "run"),
                 *("--vehicle", str(QUAD5 / "vehicle.toml"), "--port", str(port), "--pilot-port", str(pilot)),
                 *("--mavlink", f"udpout:127.0.0.1:{companion}", *arguments),
             ],

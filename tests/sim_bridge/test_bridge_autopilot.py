@@ -6,14 +6,14 @@ from collections.abc import Callable
 
 import pytest
 
-from models.vehicle import Vehicle
-from sim_bridge.autopilot import Autopilot, Landed, Verdict
-from sim_bridge.mavlink.server import pilot_order
-from sim_bridge.modes import Mode
-from sim_bridge.parameters import Parameters
-from sim_bridge.position_control import MotionSetpoint, RateSetpoint, Setpoint, yaw_of
-from sim_bridge.simulator import Simulator
-from sim_bridge.truth.hidden import choose
+from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.autopilot import Autopilot, Landed, Verdict
+from trueflight.sim_bridge.mavlink.server import pilot_order
+from trueflight.sim_bridge.modes import Mode
+from trueflight.sim_bridge.parameters import Parameters
+from trueflight.sim_bridge.position_control import MotionSetpoint, RateSetpoint, Setpoint, yaw_of
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.truth.hidden import choose
 
 
 def autopilot(vehicle: Vehicle, hidden: str = "none", **parameters: float) -> Autopilot:

@@ -10,19 +10,19 @@ from pathlib import Path
 import pytest
 from bridge_process import QUAD5, Bridge, free_ports
 
-from models.errors import InputError
-from models.vehicle import Vehicle
-from sim_bridge.parameters import Parameters
-from sim_bridge.seal import reveal, seal
-from sim_bridge.settings import load_settings
-from sim_bridge.truth.hidden import EFFECTS, RICH, choose, pool
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.parameters import Parameters
+from trueflight.sim_bridge.seal import reveal, seal
+from trueflight.sim_bridge.settings import load_settings
+from trueflight.sim_bridge.truth.hidden import EFFECTS, RICH, choose, pool
 
 VEHICLE = ("--vehicle", str(QUAD5 / "vehicle.toml"))
 
 
 def command(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", "from sim_bridge.cli import main; main()", *arguments],
+        [sys.executable, "-c", "from trueflight.sim_bridge.cli import main; main()", *arguments],
         capture_output=True,
         text=True,
         timeout=60,
@@ -177,8 +177,10 @@ def test_parameters_keep_their_type_and_range(vehicle: Vehicle) -> None:
 
 def test_the_bridge_needs_neither_the_ground_nor_the_fitted_effects() -> None:
     code = (
-        "import sys, sim_bridge.cli, sim_bridge.in_process, sim_bridge.mavlink.server, sim_bridge.seal\n"
-        "banned = ('torch', 'rerun', 'control', 'groundstation', 'models.effects', 'models.effect')\n"
+        "import sys, trueflight.sim_bridge.cli, trueflight.sim_bridge.in_process\n"
+        "import trueflight.sim_bridge.mavlink.server, trueflight.sim_bridge.seal\n"
+        "banned = ('torch', 'rerun', 'control', 'trueflight.groundstation', "
+        "'trueflight.models.effects', 'trueflight.models.effect')\n"
         "print([name for name in banned if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

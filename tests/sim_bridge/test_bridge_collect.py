@@ -12,17 +12,17 @@ from pathlib import Path
 import pytest
 from bridge_process import QUAD5
 
-from models.database import database
-from models.design import Design
-from models.record import read_record
-from models.reference import trajectory
-from models.vehicle import Vehicle
-from sim_bridge.collect import fingerprint, flights
-from sim_bridge.in_process import Plan
-from sim_bridge.seal import reveal
-from sim_bridge.truth.hidden import choose
+from trueflight.models.database import database
+from trueflight.models.design import Design
+from trueflight.models.record import read_record
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.collect import fingerprint, flights
+from trueflight.sim_bridge.in_process import Plan
+from trueflight.sim_bridge.seal import reveal
+from trueflight.sim_bridge.truth.hidden import choose
 
-PROGRAM = [sys.executable, "-c", "from sim_bridge.cli import main; main()", "collect"]
+PROGRAM = [sys.executable, "-c", "from trueflight.sim_bridge.cli import main; main()", "collect"]
 RICH = ["--vehicle", str(QUAD5 / "vehicle.toml"), "--hidden", "rich", "--seed", "2", "--json"]
 
 

@@ -7,13 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from models.frames import enu_flu_from_ned_frd, enu_from_ned, quaternion_from_euler, rotation_matrix
-from models.vehicle import GRAVITY, Vehicle
-from sim_bridge.mavlink import wire
-from sim_bridge.position_control import attitude_of_thrust, tilt_of, yaw_of
-from sim_bridge.simulator import Simulator
-from sim_bridge.truth.sensors import NO_NOISE
-from sim_bridge.world import PHYSICS_STEP
+from trueflight.models.frames import (
+    enu_flu_from_ned_frd,
+    enu_from_ned,
+    quaternion_from_euler,
+    rotation_matrix,
+)
+from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.sim_bridge.mavlink import wire
+from trueflight.sim_bridge.position_control import attitude_of_thrust, tilt_of, yaw_of
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.truth.sensors import NO_NOISE
+from trueflight.sim_bridge.world import PHYSICS_STEP
 
 
 def fly(

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.errors import InputError
-from models.frames import quaternion_from_euler, rotation_matrix
-from models.vehicle import GRAVITY, Vehicle
-from sim_bridge.simulator import Simulator
-from sim_bridge.truth.airframe import Airframe, believed_powertrain
-from sim_bridge.truth.hidden import EFFECTS, Hidden, choose, install, pool
-from sim_bridge.truth.sensors import NO_NOISE, Sensors
-from sim_bridge.world import PHYSICS_STEP
+from trueflight.models.errors import InputError
+from trueflight.models.frames import quaternion_from_euler, rotation_matrix
+from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.truth.airframe import Airframe, believed_powertrain
+from trueflight.sim_bridge.truth.hidden import EFFECTS, Hidden, choose, install, pool
+from trueflight.sim_bridge.truth.sensors import NO_NOISE, Sensors
+from trueflight.sim_bridge.world import PHYSICS_STEP
 
 STATES = list(range(6))
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.design import Design
-from models.errors import InputError
-from models.record import read_record
-from models.reference import trajectory
-from models.vehicle import GRAVITY, Vehicle
-from sim_bridge.in_process import Plan, Sample, fly, record
-from sim_bridge.truth.hidden import choose
-from sim_bridge.truth.sensors import NO_NOISE, Noise
+from trueflight.models.design import Design
+from trueflight.models.errors import InputError
+from trueflight.models.record import read_record
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.sim_bridge.in_process import Plan, Sample, fly, record
+from trueflight.sim_bridge.truth.hidden import choose
+from trueflight.sim_bridge.truth.sensors import NO_NOISE, Noise
 
 
 def believed_thrust(vehicle: Vehicle, times: np.ndarray, commands: np.ndarray) -> np.ndarray:

@@ -14,11 +14,11 @@ from bridge_process import Bridge
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mav
 
-from models.frames import enu_flu_from_ned_frd, enu_from_ned, rotate
-from sim_bridge.mavlink.esc_status import ESC_STATUS, EscStatus
-from sim_bridge.mavlink.wire import float_of_int, int_of_float
-from sim_bridge.modes import Mode
-from sim_bridge.pilot import send_order
+from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, rotate
+from trueflight.sim_bridge.mavlink.esc_status import ESC_STATUS, EscStatus
+from trueflight.sim_bridge.mavlink.wire import float_of_int, int_of_float
+from trueflight.sim_bridge.modes import Mode
+from trueflight.sim_bridge.pilot import send_order
 
 mavutil.mavlink = mav
 OFFBOARD = Mode.OFFBOARD.custom_mode

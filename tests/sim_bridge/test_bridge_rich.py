@@ -10,21 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.design import Design
-from models.errors import InputError
-from models.reference import trajectory
-from models.vehicle import GRAVITY, Vehicle
-from sim_bridge.autopilot import Autopilot
-from sim_bridge.in_process import Plan, Sample, fly, record
-from sim_bridge.mavlink.telemetry import STREAMS
-from sim_bridge.parameters import Parameters
-from sim_bridge.seal import reveal, seal
-from sim_bridge.simulator import Simulator
-from sim_bridge.truth.airframe import believed_powertrain
-from sim_bridge.truth.battery import Battery, BatteryState, in_state
-from sim_bridge.truth.hidden import EFFECTS, RICH, Hidden, choose
-from sim_bridge.truth.sensors import NO_NOISE, Sensors
-from sim_bridge.world import PHYSICS_STEP
+from trueflight.models.design import Design
+from trueflight.models.errors import InputError
+from trueflight.models.reference import trajectory
+from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.sim_bridge.autopilot import Autopilot
+from trueflight.sim_bridge.in_process import Plan, Sample, fly, record
+from trueflight.sim_bridge.mavlink.telemetry import STREAMS
+from trueflight.sim_bridge.parameters import Parameters
+from trueflight.sim_bridge.seal import reveal, seal
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.truth.airframe import believed_powertrain
+from trueflight.sim_bridge.truth.battery import Battery, BatteryState, in_state
+from trueflight.sim_bridge.truth.hidden import EFFECTS, RICH, Hidden, choose
+from trueflight.sim_bridge.truth.sensors import NO_NOISE, Sensors
+from trueflight.sim_bridge.world import PHYSICS_STEP
 
 ODOMETRY, ATTITUDE, HIGHRES_IMU = 331, 30, 105
 

@@ -20,14 +20,14 @@ from bridge_process import QUAD5, free_ports
 from px4_peer import ARMED, Hover, ParameterServer, Px4Peer
 from pymavlink.dialects.v20 import common as mav
 
-from models.errors import InputError
-from models.vehicle import Vehicle, vehicle_from_table
-from sim_bridge.mavlink.stream import MessageStream
-from sim_bridge.simulator import Simulator
-from sim_bridge.sitl import lockstep
-from sim_bridge.sitl.allocation import differences, expected_parameters
-from sim_bridge.sitl.lockstep import Ending, Lockstep, listen
-from sim_bridge.sitl.sensors import RawNoise, RawSensors
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import Vehicle, vehicle_from_table
+from trueflight.sim_bridge.mavlink.stream import MessageStream
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.sitl import lockstep
+from trueflight.sim_bridge.sitl.allocation import differences, expected_parameters
+from trueflight.sim_bridge.sitl.lockstep import Ending, Lockstep, listen
+from trueflight.sim_bridge.sitl.sensors import RawNoise, RawSensors
 
 IRIS = {
     **{"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": 4},
@@ -77,7 +77,13 @@ def sitl(tmp_path: Path) -> Iterator[Callable[..., Running]]:
         link_port = free_ports(1)[0] if link else 0
         process = subprocess.Popen(
             [
-                *(sys.executable, "-c", "from sim_bridge.cli import main; main()", "sitl", "--json"),
+                *(
+                    sys.executable,
+                    "-c",
+                    "from trueflight.sim_bridge.cli import main; main()",
+                    "sitl",
+                    "--json",
+                ),
                 *("--vehicle", str(QUAD5 / "vehicle.toml"), "--port", str(port)),
                 *("--link-port", str(link_port), *arguments),
             ],
@@ -659,7 +665,7 @@ def test_what_px4_must_have_can_be_printed(tmp_path) -> None:
 
 
 def command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    run = "from sim_bridge.cli import main; main()"
+    run = "from trueflight.sim_bridge.cli import main; main()"
     return subprocess.run(
         [sys.executable, "-c", run, "sitl", "--vehicle", str(QUAD5 / "vehicle.toml"), *arguments],
         capture_output=True,

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.frames import rotation_matrix
-from models.vehicle import Vehicle
-from sim_bridge.mavlink import wire
-from sim_bridge.simulator import Moment, Simulator
-from sim_bridge.sitl.sensors import (
+from trueflight.models.frames import rotation_matrix
+from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.mavlink import wire
+from trueflight.sim_bridge.simulator import Moment, Simulator
+from trueflight.sim_bridge.sitl.sensors import (
     FIELD,
     FORCE_STEP,
     RawNoise,
@@ -26,7 +26,7 @@ from sim_bridge.sitl.sensors import (
     rounded_by_px4,
     specific_force,
 )
-from sim_bridge.truth.hidden import choose
+from trueflight.sim_bridge.truth.hidden import choose
 
 # Rows: the axes of NED in ENU, and of FRD in FLU.
 NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

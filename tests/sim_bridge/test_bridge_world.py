@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.errors import InputError
-from models.vehicle import GRAVITY, Vehicle
-from sim_bridge.rates import IDLE_SHARE, Mixer
-from sim_bridge.simulator import Simulator
-from sim_bridge.truth.airframe import believed_powertrain
-from sim_bridge.truth.battery import Battery
-from sim_bridge.truth.sensors import NO_NOISE, Noise, Sensors
-from sim_bridge.world import PHYSICS_STEP, World
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.sim_bridge.rates import IDLE_SHARE, Mixer
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.truth.airframe import believed_powertrain
+from trueflight.sim_bridge.truth.battery import Battery
+from trueflight.sim_bridge.truth.sensors import NO_NOISE, Noise, Sensors
+from trueflight.sim_bridge.world import PHYSICS_STEP, World
 
 
 def test_free_fall_keeps_its_energy(vehicle: Vehicle) -> None:
