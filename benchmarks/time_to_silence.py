@@ -25,7 +25,7 @@ from rig import Bridge, Companion, Process, Wiretap, wait_for
 
 HANGS = """
 import signal, time
-from trueflight.companion.control import ControlLaw
+from trueflight.companion.law.control import ControlLaw
 hung = []
 signal.signal(signal.SIGUSR1, lambda *_: hung.append(1))
 step = ControlLaw.step

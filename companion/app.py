@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from trueflight.companion.control import ControlLaw
 from trueflight.companion.director import Director
 from trueflight.companion.flight import IDLE, Flight
+from trueflight.companion.law.control import ControlLaw
 from trueflight.companion.mission_request import SMALL, read_json, read_request
 from trueflight.companion.pose import PoseFeed
 from trueflight.companion.settings import Settings

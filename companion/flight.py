@@ -18,13 +18,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from trueflight.companion.agreement import Agreement, AgreementLimits
-from trueflight.companion.control import IDLE_STEP, Attitude, ControlLaw, ControlStep, State, euler, features
-from trueflight.companion.controllers import Controller, TrimLimits, make_controller
-from trueflight.companion.guard import Guard
+from trueflight.companion.law.control import (
+    IDLE_STEP,
+    Attitude,
+    ControlLaw,
+    ControlStep,
+    State,
+    euler,
+    features,
+)
+from trueflight.companion.law.controllers import Controller, TrimLimits, make_controller
+from trueflight.companion.law.guard import Guard
+from trueflight.companion.law.watch import Watch
 from trueflight.companion.resets import Reset, found_reset
 from trueflight.companion.shadow import Shadow, error_acceleration
 from trueflight.companion.vehicle_link import Latest, Odometry
-from trueflight.companion.watch import Watch
 from trueflight.models.contract import CONTROLLERS, CORRECTED
 from trueflight.models.errors import InputError
 from trueflight.models.reference import Trajectory, transfer

@@ -21,7 +21,7 @@ from trueflight.companion.confined import confine, leave_network
 from trueflight.models.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from trueflight.companion.inference import ModelInfo, Verdict
+    from trueflight.companion.law.inference import ModelInfo, Verdict
 
 CHILD = (sys.executable, "-m", "trueflight.companion.inspection")
 PATIENCE = 30.0
@@ -49,7 +49,7 @@ class Finding:
 
 
 def inspect(files: Sequence[bytes], vehicle: Vehicle, deadline: float) -> list[Finding]:
-    """Check files as `companion.inference.check_model` does, in a child; never raises, whatever they hold.
+    """Check files as `companion.law.inference.check_model` does, in a child; never raises, whatever they hold.
 
     Blocks while the child runs. A file that takes the child down with it is refused; the others get another.
     """
@@ -84,8 +84,8 @@ def _ask_child(files: Sequence[bytes], vehicle: Vehicle, deadline: float) -> tup
 
 
 def _finding(answer: dict[str, Any]) -> Finding:
-    from trueflight.companion.actuation import Actuation
-    from trueflight.companion.inference import ModelInfo, Range
+    from trueflight.companion.law.actuation import Actuation
+    from trueflight.companion.law.inference import ModelInfo, Range
 
     info = answer["info"]
     if info is not None:
@@ -113,7 +113,7 @@ def _main() -> None:
     network = leave_network()
     descriptor, whole = begin_child()
     answers = os.fdopen(descriptor, "w")
-    from trueflight.companion.inference import check_model, warm_up
+    from trueflight.companion.law.inference import check_model, warm_up
 
     warm_up()
     line, _, rest = whole.partition(b"\n")

@@ -13,8 +13,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from trueflight.companion.control import euler, world_from_body
-from trueflight.companion.watch import ZERO, Vector, Watch
+from trueflight.companion.law.control import euler, world_from_body
+from trueflight.companion.law.watch import ZERO, Vector, Watch
 from trueflight.models.vehicle import GRAVITY
 
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from trueflight.companion.inference import MAX_BYTES, Model, ModelInfo, open_model
 from trueflight.companion.inspection import Finding, inspect
+from trueflight.companion.law.inference import MAX_BYTES, Model, ModelInfo, open_model
 from trueflight.models.contract import model_hash
 from trueflight.models.errors import InputError
 from trueflight.models.vehicle import Vehicle

@@ -324,7 +324,7 @@ def fly(
     )
     settings = load_settings(config, {name: value for name, value in locals().items() if name in names})
     believed = load_vehicle(settings.vehicle)
-    from trueflight.companion.controllers import TrimLimits
+    from trueflight.companion.law.controllers import TrimLimits
     from trueflight.models.design import load_design
     from trueflight.sim_bridge.in_process import Plan, record
     from trueflight.sim_bridge.truth.hidden import choose

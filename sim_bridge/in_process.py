@@ -14,10 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from trueflight.companion.control import ControlLaw, ControlStep, State
-from trueflight.companion.controllers import Preview, TrimLimits, make_controller
-from trueflight.companion.guard import Guard
-from trueflight.companion.inference import check_model
+from trueflight.companion.law.control import ControlLaw, ControlStep, State
+from trueflight.companion.law.controllers import Preview, TrimLimits, make_controller
+from trueflight.companion.law.guard import Guard
+from trueflight.companion.law.inference import check_model
 from trueflight.models.contract import CORRECTED, LQR
 from trueflight.models.design import Design
 from trueflight.models.errors import InputError
@@ -43,7 +43,7 @@ class Plan:
     """One flight: who flies what, with what hidden. `rate` of the control law in Hz, `model` an ONNX file's
     bytes.
 
-    `controller` is one of `companion.controllers.CONTROLLERS`; `corrected` needs a `model`, the others take none.
+    `controller` is one of `companion.law.controllers.CONTROLLERS`; `corrected` needs a `model`, the others take none.
     Where it is empty the vehicle flies `corrected` with a model and `lqr` without. For `settle` s the vehicle holds
     the start before the trajectory begins, as the companion does: a correction has faded in by then. The record has
     `rotor_speeds` where the vehicle's speed controllers report them.

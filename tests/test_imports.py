@@ -79,6 +79,14 @@ def test_neither_simulator_nor_companion_sees_the_effects(package: str) -> None:
         assert not seen, f"{path.relative_to(ROOT)} imports {sorted(seen)}"
 
 
+def test_the_law_stands_alone_and_is_all_that_the_simulator_sees_of_the_companion() -> None:
+    law = "trueflight.companion.law"
+    for folder in ("companion/law", "sim_bridge"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            seen = {n for n in imports(path) if n.startswith("trueflight.companion") and not n.startswith(law)}
+            assert not seen, f"{path.relative_to(ROOT)} imports {sorted(seen)}"
+
+
 def test_groundstation_never_imports_the_simulator() -> None:
     for path in sorted((ROOT / "groundstation").rglob("*.py")):
         assert not any(n.startswith("trueflight.sim_bridge") for n in imports(path)), path
@@ -99,7 +107,7 @@ def test_a_light_process_loads_no_heavy_library(module: str) -> None:
 @pytest.mark.parametrize(
     "module",
     [
-        "trueflight.companion.inference",
+        "trueflight.companion.law.inference",
         "trueflight.companion.inspection",
         "trueflight.groundstation.commands.app",
         "trueflight.models.export",

@@ -1,6 +1,6 @@
 """What a flight tells of the path from command to motion: the numbers that the corrected controller undoes.
 
-The rate loop is fitted as the PI controller behind a delay that `companion.actuation` runs beside the real one:
+The rate loop is fitted as the PI controller behind a delay that `companion.law.actuation` runs beside the real one:
 `w' = (c - w) / lag + i`, `i' = integral (c - w) / lag`, c the commanded body rate `delay` ago. It is an
 output-error fit (Ljung, "System Identification", 2nd edition, section 10.2), so noise of the gyroscope does not
 bias it, and both sides pass the same low-pass filter: only what an attitude loop can use has to be right.

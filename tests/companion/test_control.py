@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trueflight.companion.control import ControlLaw, Limits, State, euler, features
+from trueflight.companion.law.control import ControlLaw, Limits, State, euler, features
 from trueflight.models import frames
 from trueflight.models.contract import FEATURES, YAW_FEATURES
 from trueflight.models.design import hover_input_matrix, load_design

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trueflight.companion.actuation import ACTS_AT_ONCE, Actuation, LagInverse, RateModel
-from trueflight.companion.behaviour import LinearBehaviour
-from trueflight.companion.control import ZERO, ControlLaw, State, euler
-from trueflight.companion.controllers import Corrected, Lqr, LqrIntegral, TrimLimits, make_controller
-from trueflight.companion.guard import Correction
+from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation, LagInverse, RateModel
+from trueflight.companion.law.behaviour import LinearBehaviour
+from trueflight.companion.law.control import ZERO, ControlLaw, State, euler
+from trueflight.companion.law.controllers import Corrected, Lqr, LqrIntegral, TrimLimits, make_controller
+from trueflight.companion.law.guard import Correction
 from trueflight.groundstation.design.linear_response import Reference, expected_behaviour
 from trueflight.groundstation.identify.actuation import respond
 from trueflight.models import frames

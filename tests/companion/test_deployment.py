@@ -24,8 +24,8 @@ from onnx_models import (
 from rig import PATIENT, Bridge, Companion, free_port, wait_for
 
 from trueflight.companion import inspection
+from trueflight.companion.law.watch import GuardLimits
 from trueflight.companion.store import ModelStore
-from trueflight.companion.watch import GuardLimits
 from trueflight.models import contract
 from trueflight.models.record import FlightRecord, read_record
 from trueflight.models.vehicle import load_vehicle

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trueflight.companion.control import ControlLaw
 from trueflight.companion.flight import (
     IDLE,
     LANDING,
@@ -22,9 +21,10 @@ from trueflight.companion.flight import (
     Outcome,
     Safety,
 )
-from trueflight.companion.guard import Guard
+from trueflight.companion.law.control import ControlLaw
+from trueflight.companion.law.guard import Guard
+from trueflight.companion.law.watch import Range, Watch
 from trueflight.companion.vehicle_link import Latest, Odometry
-from trueflight.companion.watch import Range, Watch
 from trueflight.models.contract import FEATURES
 from trueflight.models.design import load_design
 from trueflight.models.errors import InputError

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trueflight.companion.guard import Guard
-from trueflight.companion.watch import GuardLimits, Range, Watch
+from trueflight.companion.law.guard import Guard
+from trueflight.companion.law.watch import GuardLimits, Range, Watch
 from trueflight.models.contract import FEATURES
 
 LIMITS = GuardLimits(fade=0.5)

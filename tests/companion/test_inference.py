@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from onnx_models import RANGES, constant_model, drag_model, linear_model
 
-from trueflight.companion.inference import MAX_BYTES, check_model
+from trueflight.companion.law.inference import MAX_BYTES, check_model
 from trueflight.companion.store import ModelStore
 from trueflight.models import contract
 from trueflight.models.vehicle import load_vehicle

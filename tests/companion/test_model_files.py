@@ -15,8 +15,8 @@ from onnx import TensorProto, helper, numpy_helper
 from onnx_models import drag_model
 
 from trueflight.companion import inspection
-from trueflight.companion.inference import check_model
-from trueflight.companion.onnx_structure import why_not_self_contained
+from trueflight.companion.law.inference import check_model
+from trueflight.companion.law.onnx_structure import why_not_self_contained
 from trueflight.models import contract
 from trueflight.models.vehicle import load_vehicle
 
@@ -100,7 +100,9 @@ def test_weights_in_another_file_are_refused_before_a_runtime_sees_them(
 ) -> None:
     model = onnx.ModelProto.FromString(drag_model(0.1))
     PLACES[place](model)
-    monkeypatch.setattr("trueflight.companion.inference._open", lambda onnx: pytest.fail("a runtime saw it"))
+    monkeypatch.setattr(
+        "trueflight.companion.law.inference._open", lambda onnx: pytest.fail("a runtime saw it")
+    )
     verdict = check_model(model.SerializeToString(), VEHICLE)
     assert not verdict.accepted
     assert "external data" in verdict.reason

@@ -20,7 +20,7 @@ LOSS_TIME = 1.0  # s: COM_OF_LOSS_T, as the bridge and PX4 have it by default
 
 HANGS = """
 import signal, time
-from trueflight.companion.control import ControlLaw
+from trueflight.companion.law.control import ControlLaw
 hung = []
 signal.signal(signal.SIGUSR1, lambda *_: hung.append({kind!r}))
 step = ControlLaw.step

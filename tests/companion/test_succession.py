@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trueflight.companion.guard import Guard
+from trueflight.companion.law.guard import Guard
+from trueflight.companion.law.watch import GuardLimits, Range, Watch
 from trueflight.companion.shadow import Shadow, ShadowLimits, error_acceleration
-from trueflight.companion.watch import GuardLimits, Range, Watch
 from trueflight.models import frames
 
 LIMITS = GuardLimits(fade=0.5)

@@ -30,7 +30,7 @@ HANG = 2.0
 
 HANGS = f"""
 import signal, time
-from trueflight.companion.control import ControlLaw
+from trueflight.companion.law.control import ControlLaw
 hangs = []
 signal.signal(signal.SIGUSR1, lambda *_: hangs.append(0.1))
 signal.signal(signal.SIGUSR2, lambda *_: hangs.append(0.0))

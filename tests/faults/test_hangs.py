@@ -17,7 +17,7 @@ LOSS_TIME = 0.5  # s: COM_OF_LOSS_T
 
 SLEEPS = """
 import signal, time
-from trueflight.companion.control import ControlLaw
+from trueflight.companion.law.control import ControlLaw
 waiting = []
 signal.signal(signal.SIGUSR1, lambda *_: waiting.append(2.5))
 step = ControlLaw.step
@@ -31,7 +31,7 @@ ControlLaw.step = hanging
 """
 SLOW = """
 import time
-from trueflight.companion.control import ControlLaw
+from trueflight.companion.law.control import ControlLaw
 step = ControlLaw.step
 def slow(self, *arguments, **named):
     time.sleep(0.012)

@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trueflight.companion.inference import check_model
+from trueflight.companion.law.inference import check_model
 from trueflight.models import contract
 from trueflight.models.errors import InputError
 from trueflight.models.export import Correction, export_onnx, sequential

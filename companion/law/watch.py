@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from trueflight.companion.actuation import ACTS_AT_ONCE, Actuation
+from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
 
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)

@@ -16,8 +16,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import astuple
 from typing import NamedTuple
 
-from trueflight.companion.actuation import ACTS_AT_ONCE, Actuation
-from trueflight.companion.watch import ZERO, GuardLimits, Vector, Watch
+from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
+from trueflight.companion.law.watch import ZERO, GuardLimits, Vector, Watch
 
 OFF, FADING_IN, ACTIVE, FADING_OVER, FADING_OUT, TRIPPED = (
     "off",

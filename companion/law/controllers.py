@@ -20,9 +20,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from trueflight.companion.actuation import Actuation, LagInverse, RateModel
-from trueflight.companion.behaviour import LinearBehaviour
-from trueflight.companion.control import (
+from trueflight.companion.law.actuation import Actuation, LagInverse, RateModel
+from trueflight.companion.law.behaviour import LinearBehaviour
+from trueflight.companion.law.control import (
     ZERO,
     Attitude,
     ControlLaw,
@@ -33,7 +33,7 @@ from trueflight.companion.control import (
     features,
     world_from_body,
 )
-from trueflight.companion.guard import Correction
+from trueflight.companion.law.guard import Correction
 from trueflight.models.contract import CONTROLLERS, CORRECTED, LQR, LQR_INTEGRAL
 from trueflight.models.errors import InputError
 from trueflight.models.trajectory import ReferenceSample
@@ -49,7 +49,7 @@ _INTEGRAL_AUTHORITY = 3.0  # m/s², the most that the integral of `lqr_integral`
 
 
 class Corrector(Protocol):
-    """What stands between learned models and the command: `companion.guard.Guard`."""
+    """What stands between learned models and the command: `companion.law.guard.Guard`."""
 
     wants_yaw: bool
 

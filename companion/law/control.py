@@ -133,7 +133,7 @@ def features(
 class ControlLaw:
     """The cascade for one vehicle and one design, with or without a correction.
 
-    It holds no state of its own: what changes from tick to tick is in `companion.controllers`. Raises
+    It holds no state of its own: what changes from tick to tick is in `companion.law.controllers`. Raises
     `InputError` where the design belongs to another vehicle.
     """
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from trueflight.companion.actuation import ACTS_AT_ONCE, Actuation
-from trueflight.companion.onnx_structure import why_not_self_contained
-from trueflight.companion.watch import GuardLimits, Range, Watch
+from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
+from trueflight.companion.law.onnx_structure import why_not_self_contained
+from trueflight.companion.law.watch import GuardLimits, Range, Watch
 from trueflight.models import contract
 from trueflight.models.errors import InputError, shown
 from trueflight.models.vehicle import Vehicle
