@@ -88,7 +88,7 @@ class Columns:
         ]
         columns, self.owner = [], []
         for e in self.candidates:
-            through = [effect_named(e.with_any[0])] if e.with_any else []
+            through = [effect_named(e.acts_through[0])] if e.acts_through else []
             chain = [self.body, *((t, t.typical(problem.survey)) for t in through)]
             without = problem.predict(chain) if through else base
             placed = {**e.neutral(problem.vehicle), **self.places(e)}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from trueflight.companion.director import Director
-from trueflight.companion.flight import IDLE, Flight
+from trueflight.companion.flight import IDLE, FlightStateMachine
 from trueflight.companion.law.control import ControlLaw
 from trueflight.companion.mission_request import SMALL, read_json, read_request
 from trueflight.companion.pose import PoseFeed
@@ -83,7 +83,7 @@ class Companion:
             "loose": plan.loose,
             "listen": list(plan.listen),
         }
-        self.flight = Flight(law, settings.safety, self.emit, settings.trim, settings.agreement)
+        self.flight = FlightStateMachine(law, settings.safety, self.emit, settings.trim, settings.agreement)
         self.director = Director(
             self.link,
             self.flight,

@@ -1,7 +1,7 @@
 """What happens around a flight: checks, mode changes, arming, the queue of missions, the record, the status.
 
 Everything here may block and runs on the main thread or the service thread; the control thread only ever
-looks at `Flight`. Answers to the ground are dictionaries with `accepted` and `reason`.
+looks at `FlightStateMachine`. Answers to the ground are dictionaries with `accepted` and `reason`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from trueflight.companion.flight import (
     SILENT,
     TAKEOFF,
     Decision,
-    Flight,
+    FlightStateMachine,
     Mission,
     Safety,
 )
@@ -75,7 +75,7 @@ class Director:
     """
 
     link: VehicleLink
-    flight: Flight
+    flight: FlightStateMachine
     vehicle: Vehicle
     design: Design
     store: ModelStore
@@ -416,7 +416,7 @@ class Director:
         outcome = self.flight.outcome
         self.emit("info", "mission_ended", f"{mission.trajectory.name}: {outcome}")
         progress.record = self.records.end()
-        # Told last: whoever hears that it is over may fetch the record, which must be whole by then.
+        # CitedValue last: whoever hears that it is over may fetch the record, which must be whole by then.
         progress.reason = outcome
         progress.state = "finished" if outcome == "finished" else "aborted"
         if progress.state == "aborted":

@@ -178,7 +178,7 @@ class Outcome:
 
 
 @dataclass
-class Flight:
+class FlightStateMachine:
     """The state machine of a flight; `tick` belongs to the control thread, the rest may be called from any.
 
     `on_event(level, kind, text)` must only enqueue. Orders from other threads wait for the next tick.

@@ -71,7 +71,7 @@ class Preflight:
 
 
 @dataclass(frozen=True)
-class Wish:
+class RequiredParameter:
     """What a parameter should be: `good` tells whether a value is, `change` makes one of what is there.
 
     `state` is how bad it is where it is not; `otherwise` is looked at in a PX4 that does not have the parameter.
@@ -84,10 +84,10 @@ class Wish:
     change: Callable[[Number], Number | None]
     state: str = FAIL
     reboot: bool = False
-    otherwise: Wish | None = None
+    otherwise: RequiredParameter | None = None
 
 
-def wishes(settings: Settings) -> list[Wish]:
+def required_parameters(settings: Settings) -> list[RequiredParameter]:
     """The parameters that a flight with these settings needs, in the order of their weight.
 
     Source: PX4's parameter reference; the first two decide what happens when the companion falls silent.
@@ -95,28 +95,28 @@ def wishes(settings: Settings) -> list[Wish]:
     fence = settings.safety
     across, up = math.ceil(1.5 * fence.fence_radius), math.ceil(1.5 * fence.fence_height)
     out = [
-        Wish(
+        RequiredParameter(
             "COM_OF_LOSS_T",
             "0.2 to 1 s",
             "how long PX4 flies on after the companion fell silent",
             lambda v: 0.2 <= v <= 1.0,
             lambda v: 0.5,
         ),
-        Wish(
+        RequiredParameter(
             "COM_OBL_RC_ACT",
             "4 (Land), 3 (Return) or 5 (Hold)",
             "what it does then; 0 to 2 need a pilot and end in a blind descent without one",
             lambda v: v in (3, 4, 5),
             lambda v: 4,
         ),
-        Wish(
+        RequiredParameter(
             "COM_RC_OVERRIDE",
             "bit 1 (2 or 3)",
             "moving the sticks takes over in Offboard as well",
             lambda v: bool(int(v) & 2),
             lambda v: int(v) | 2,
             WARN,
-            otherwise=Wish(
+            otherwise=RequiredParameter(
                 "MAN_OVERRIDE_SPD",
                 "0 or more",
                 "moving the sticks this fast takes over; negative: never (PX4 1.18)",
@@ -125,7 +125,7 @@ def wishes(settings: Settings) -> list[Wish]:
                 WARN,
             ),
         ),
-        Wish(
+        RequiredParameter(
             "COM_RCL_EXCEPT",
             "0 with a radio, bit 2 (4) without",
             "bit 2: losing the radio does not end Offboard",
@@ -133,7 +133,7 @@ def wishes(settings: Settings) -> list[Wish]:
             lambda v: None,
             NOTE,
         ),
-        Wish(
+        RequiredParameter(
             "EKF2_NOAID_TOUT",
             "at most 1000000 us",
             "how long PX4 1.16 and later calls a position without GPS or mocap valid, and drifts",
@@ -141,7 +141,7 @@ def wishes(settings: Settings) -> list[Wish]:
             lambda v: 1_000_000,
             WARN,
         ),
-        Wish(
+        RequiredParameter(
             "COM_LOW_BAT_ACT",
             "2 (Land) or 3 (Return)",
             "what PX4 does at a critical battery; 0 only warns",
@@ -149,7 +149,7 @@ def wishes(settings: Settings) -> list[Wish]:
             lambda v: 2,
             WARN,
         ),
-        Wish(
+        RequiredParameter(
             "GF_MAX_HOR_DIST",
             f"about {across:d} m",
             f"PX4's own fence, outside the companion's {fence.fence_radius:g} m; 0 is none",
@@ -157,7 +157,7 @@ def wishes(settings: Settings) -> list[Wish]:
             lambda v: float(across),
             WARN,
         ),
-        Wish(
+        RequiredParameter(
             "GF_MAX_VER_DIST",
             f"about {up:d} m",
             f"PX4's own ceiling, above the companion's {fence.fence_height:g} m; 0 is none",
@@ -165,7 +165,7 @@ def wishes(settings: Settings) -> list[Wish]:
             lambda v: float(up),
             WARN,
         ),
-        Wish(
+        RequiredParameter(
             "GF_ACTION",
             "2 (Hold), 3 (Return) or 5 (Land)",
             "what PX4 does outside of it; 1 only warns",
@@ -177,7 +177,7 @@ def wishes(settings: Settings) -> list[Wish]:
     if settings.rate > 100.0:
         period = int(1e6 / settings.rate)
         out.append(
-            Wish(
+            RequiredParameter(
                 "EKF2_PREDICT_US",
                 f"at most {period} us",
                 f"the estimator gives odometry no faster than this; {settings.rate:g} Hz are asked for",
@@ -188,14 +188,14 @@ def wishes(settings: Settings) -> list[Wish]:
         )
     if settings.pose.enabled:
         out += [
-            Wish(
+            RequiredParameter(
                 "EKF2_EV_CTRL",
                 "bits 0, 1 and 3 (11)",
                 "takes position, height and yaw from mocap or vision",
                 lambda v: int(v) & 11 == 11,
                 lambda v: int(v) | 11,
             ),
-            Wish(
+            RequiredParameter(
                 "EKF2_HGT_REF",
                 "3 (vision)",
                 "height is that of mocap or vision",
@@ -204,7 +204,7 @@ def wishes(settings: Settings) -> list[Wish]:
                 WARN,
                 True,
             ),
-            Wish(
+            RequiredParameter(
                 "EKF2_GPS_CTRL",
                 "0",
                 "GPS would pull against mocap or vision",
@@ -212,7 +212,7 @@ def wishes(settings: Settings) -> list[Wish]:
                 lambda v: 0,
                 WARN,
             ),
-            Wish(
+            RequiredParameter(
                 "EKF2_MAG_TYPE",
                 "5 (none)",
                 "the compass would pull against the yaw of mocap or vision",
@@ -221,7 +221,7 @@ def wishes(settings: Settings) -> list[Wish]:
                 WARN,
                 True,
             ),
-            Wish(
+            RequiredParameter(
                 "EKF2_EV_DELAY",
                 "about 0 ms",
                 "poses carry the time when they were taken ([pose] latency)",
@@ -269,9 +269,9 @@ def look(
     progress("arming checks")
     arming = tuple(_arming(link, settings, vehicle))
     parameters = []
-    for wish in wishes(settings):
-        progress(wish.name)
-        parameters.append(judge(link, wish))
+    for required in required_parameters(settings):
+        progress(required.name)
+        parameters.append(judge(link, required))
     progress("hover thrust")
     records = Path(settings.records)
     hover = list(_hover(link, vehicle, records))
@@ -380,19 +380,22 @@ def _shown(value: Number) -> str:
     return str(value) if isinstance(value, int) else f"{value:g}"
 
 
-def judge(link: VehicleLink, wish: Wish) -> Parameter:
-    """What the autopilot has where a wish stands, and what should become of it."""
-    value = link.parameter(wish.name)
-    if value is None and wish.otherwise is not None:
-        return judge(link, wish.otherwise)
+def judge(link: VehicleLink, required: RequiredParameter) -> Parameter:
+    """What the autopilot has where one is required, and what should become of it."""
+    value = link.parameter(required.name)
+    if value is None and required.otherwise is not None:
+        return judge(link, required.otherwise)
     if value is None:
-        return Parameter(wish.name, "not there", wish.wanted, wish.why, NOTE)
-    if wish.good(value):
-        return Parameter(wish.name, _shown(value), wish.wanted, wish.why, NOTE if wish.state == NOTE else OK)
-    change = wish.change(value)
+        return Parameter(required.name, "not there", required.wanted, required.why, NOTE)
+    if required.good(value):
+        state = NOTE if required.state == NOTE else OK
+        return Parameter(required.name, _shown(value), required.wanted, required.why, state)
+    change = required.change(value)
     if change is not None:
         change = type(value)(change)  # PX4 takes an INT32 as an INT32 only
-    return Parameter(wish.name, _shown(value), wish.wanted, wish.why, wish.state, change, wish.reboot)
+    return Parameter(
+        required.name, _shown(value), required.wanted, required.why, required.state, change, required.reboot
+    )
 
 
 def _rates(link: VehicleLink, settings: Settings, rates: Rates) -> Iterator[Finding]:

@@ -118,12 +118,12 @@ class Effect:
     """A physical effect, ready to fit, predict, diagnose, explain and export.
 
     `needs` names the columns of `models.flight.COLUMNS` it reads, `needs_any` those of which one is enough;
-    `with_any` the effects of which one must be in the model for this one to act (wind acts through drag); `exports`
-    is False for an effect with memory, which a static correction cannot hold. `beyond` names simpler effects with
+    `acts_through` the effects of which one must be in the model for this one to act (wind acts through drag); `exports`
+    is False for an effect with memory, which a static correction cannot hold. `generalises` names simpler effects with
     which this one coincides unless the flight varies what it depends on (a bent thrust curve in a hover is a thrust
     gain). `aliases` are physical quantities that no flight can tell apart from this effect. `unconfounded` is the
     reason why an effect has no confounder. `rotational` effects are found in the angular acceleration; `seen_as`
-    names the effects that such a one is taken for where the flight lacks the columns to tell. `one_of` is True where
+    names the effects that such a one is taken for where the flight lacks the columns to tell. `exclusive` is True where
     at most one of the parameters acts (the one rotor that is damaged): each is then a candidate on its own.
     `typical_for` gives sizes that depend on where the flight went (a ceiling just above its highest point) instead of
     the parameters' own; `starts_for` further values to begin a fit from, where one start may end in a wrong optimum.
@@ -138,15 +138,15 @@ class Effect:
     manoeuvre: str
     citation: str
     confounded_with: tuple[str, ...] = ()
-    with_any: tuple[str, ...] = ()
+    acts_through: tuple[str, ...] = ()
     aliases: tuple[str, ...] = ()
-    beyond: tuple[str, ...] = ()
+    generalises: tuple[str, ...] = ()
     exports: bool = True
     needs_any: tuple[str, ...] = ()
     unconfounded: str = ""
     rotational: bool = False
     seen_as: tuple[str, ...] = ()
-    one_of: bool = False
+    exclusive: bool = False
     typical_for: Callable[[Motion], Mapping[str, float]] | None = None
     starts_for: Callable[[Motion], Sequence[Mapping[str, float]]] | None = None
 

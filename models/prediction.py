@@ -129,7 +129,7 @@ def motion_of_features(columns: Mapping[str, Array], vehicle: Vehicle) -> Motion
     )
 
 
-def act(motion: Motion, chain: Chain) -> Motion:
+def apply_effects(motion: Motion, chain: Chain) -> Motion:
     """The motion with the effects of `chain` acting, stage by stage."""
     at: dict[Stage, list[tuple[Effect, Mapping[str, Any]]]] = {stage: [] for stage in Stage}
     for effect, values in chain:
@@ -214,5 +214,5 @@ def specific_force(motion: Motion) -> np.ndarray:
 def error_acceleration(motion: Motion, chain: Chain) -> Array:
     """`delta_hat` (N, 3): acceleration of the chain minus the hover linearisation at the same input, heading frame."""
     linear = linear_thrust(motion)
-    acted = act(motion, chain)
+    acted = apply_effects(motion, chain)
     return acted.thrust_acceleration + to_heading(acted, acted.force) - linear

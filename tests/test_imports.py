@@ -83,7 +83,9 @@ def test_the_law_stands_alone_and_is_all_that_the_simulator_sees_of_the_companio
     law = "trueflight.companion.law"
     for folder in ("companion/law", "sim_bridge"):
         for path in sorted((ROOT / folder).rglob("*.py")):
-            seen = {n for n in imports(path) if n.startswith("trueflight.companion") and not n.startswith(law)}
+            seen = {
+                n for n in imports(path) if n.startswith("trueflight.companion") and not n.startswith(law)
+            }
             assert not seen, f"{path.relative_to(ROOT)} imports {sorted(seen)}"
 
 

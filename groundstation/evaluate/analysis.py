@@ -173,7 +173,7 @@ def steps_to(diagnosis: Diagnosis, bandwidth: float | None = None) -> list[Model
     order: list[str] = []
     while waiting:
         present = {*base.names(), *order}
-        through = {n: effect_named(n, base.effects_directory).with_any for n in waiting}
+        through = {n: effect_named(n, base.effects_directory).acts_through for n in waiting}
         order.append(next((n for n in waiting if not through[n] or present & set(through[n])), waiting[0]))
         waiting.remove(order[-1])
     problem = Problem((measure(diagnosis.flight, bandwidth),), base.effects_directory, base.network_chain())

@@ -215,7 +215,7 @@ def memory(d: np.ndarray, decay: float, dt: float) -> np.ndarray:
     return np.sqrt(signal.lfilter([1.0 - keep], [1.0, -keep], np.asarray(d) ** 2))
 
 
-def tube(
+def stability_tube(
     ball: Ball, radius: float, bound: float, t: np.ndarray, start: float, jumps: np.ndarray
 ) -> np.ndarray:
     """What V^(1/2) (N,) may at most be at times `t` (N,) s, from `start` at the first, in m/s².
@@ -283,7 +283,7 @@ def predict_tube(
         levels.append(level)
         tubes.append(
             [
-                tube(ball, radius[k], bound[k], mission.t, level[0, k], mission.jumps[:, k])
+                stability_tube(ball, radius[k], bound[k], mission.t, level[0, k], mission.jumps[:, k])
                 for k, ball in enumerate(balls)
             ]
         )

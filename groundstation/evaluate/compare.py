@@ -11,7 +11,7 @@ from trueflight.models.effect import Motion
 from trueflight.models.flight import Flight
 from trueflight.models.frames import euler_from_quaternion, heading_from_world, world_from_heading
 from trueflight.models.model import Model, linear_model
-from trueflight.models.prediction import Chain, acceleration, act, motion_of_flight, specific_force
+from trueflight.models.prediction import Chain, acceleration, apply_effects, motion_of_flight, specific_force
 from trueflight.models.vehicle import GRAVITY
 
 HORIZONS = (0.1, 0.5, 1.0)
@@ -73,7 +73,7 @@ def waterfall(
 
 
 def _predicted(measurement: Measurement, motion: Motion, chain: Chain) -> np.ndarray:
-    return heading_acceleration(motion, measurement.see(specific_force(act(motion, chain))))
+    return heading_acceleration(motion, measurement.see(specific_force(apply_effects(motion, chain))))
 
 
 def heading_acceleration(motion: Motion, force: np.ndarray) -> np.ndarray:
@@ -116,14 +116,14 @@ def _horizons(flight: Flight, motion: Motion, chain: Chain, used: np.ndarray) ->
     starts = starts[unused[starts + longest] - unused[starts] <= 0.1 * longest]
     if len(starts) < 3:
         return ()
-    acting = act(motion, [(e, v) for e, v in chain if e.stage == 0])
+    acting = apply_effects(motion, [(e, v) for e, v in chain if e.stage == 0])
     base = motion.with_(command=acting.command, thrust=acting.command, tau=0.0, delay=0.0)
     rest = [(e, v) for e, v in chain if e.stage != 0]
     yaw = euler_from_quaternion(attitude)[:, 2]
 
     def world_acceleration(k: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         at = _rows(base, k).with_(height=position[:, 2], air_velocity=heading_from_world(velocity, yaw[k]))
-        return world_from_heading(acceleration(act(at, rest)), yaw[k])
+        return world_from_heading(acceleration(apply_effects(at, rest)), yaw[k])
 
     position, velocity = flown[starts].copy(), speed[starts].copy()
     now = world_acceleration(starts, position, velocity)

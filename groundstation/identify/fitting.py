@@ -22,7 +22,7 @@ from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.models.effect import Effect, Motion, Parameter, Stage
 from trueflight.models.effects import effect_named
 from trueflight.models.model import Model, Term
-from trueflight.models.prediction import Chain, act, motion_of_flight, specific_force
+from trueflight.models.prediction import Chain, apply_effects, motion_of_flight, specific_force
 from trueflight.models.vehicle import Vehicle
 
 HAC_LAG = 2.0
@@ -35,7 +35,7 @@ BLOCK = 5.0
 
 
 @dataclass(frozen=True)
-class Free:
+class FreeParameter:
     """One free number of a fit: a parameter of an effect, its start and its bounds."""
 
     effect: str
@@ -75,7 +75,7 @@ class Problem:
         """Predicted specific force (K, A) of the used samples of all flights, behind each flight's filter."""
         parts = []
         for m, motion in zip(self.measurements, self.motions, strict=True):
-            force = m.see(specific_force(act(motion, [*chain, *self.always])))
+            force = m.see(specific_force(apply_effects(motion, [*chain, *self.always])))
             parts.append(force[m.used][:, m.axes])
         return np.concatenate(parts)
 
@@ -121,7 +121,7 @@ class Fit:
     """
 
     terms: tuple[Term, ...]
-    free: tuple[Free, ...]
+    free: tuple[FreeParameter, ...]
     estimate: np.ndarray
     covariance: np.ndarray
     critical: float
@@ -129,7 +129,7 @@ class Fit:
     residual: np.ndarray
 
     @property
-    def surprise(self) -> float:
+    def prior_penalty(self) -> float:
         """How far the parameters are from "no effect", in squared standard deviations of the prior."""
         return float(
             sum(((x - f.neutral) / f.spread) ** 2 for x, f in zip(self.estimate, self.free, strict=True))
@@ -187,7 +187,7 @@ SCALE = 0.005
 accelerometer or gyroscope (TDK ICM-42688-P datasheet: 0.5 %). No law of the catalogue is truer either."""
 
 
-def half_width(free: Free, value: float, variance: float, critical: float) -> float:
+def half_width(free: FreeParameter, value: float, variance: float, critical: float) -> float:
     """Half of a 95 % interval around `value`, never below what clock and scale of the sensors allow."""
     scale = 0.0 if free.parameter.structural else SCALE * value
     return float(np.hypot(critical * np.sqrt(max(variance, 0.0)), scale)) + free.tolerance
@@ -201,7 +201,7 @@ def critical_value(duration: float) -> float:
 
 def free_parameters(
     effect: Effect, motion: Motion, start: Mapping[str, float] | None = None, period: float = 0.0
-) -> list[Free]:
+) -> list[FreeParameter]:
     """The numbers of `effect` to fit to a flight, on a clock of `period` s.
 
     Bounds reach a little beyond the plausible range, so that data may contradict
@@ -217,7 +217,7 @@ def free_parameters(
         low, high = p.low - margin, p.high + margin
         tolerance = period * CLOCK.get(effect.name, 0.0)
         value = float(np.clip(value, low + 1e-9, high - 1e-9))
-        free.append(Free(effect.name, p, value, low, high, neutral, tolerance))
+        free.append(FreeParameter(effect.name, p, value, low, high, neutral, tolerance))
     return free
 
 
@@ -235,7 +235,7 @@ def fit(
     """
     vehicle, names = problem.vehicle, [t.effect for t in terms]
     fixed = {t.effect: dict(t.values) for t in terms}
-    free: list[Free] = []
+    free: list[FreeParameter] = []
     period = max(m.flight.dt for m in problem.measurements)
     for term in terms:
         effect = effect_named(term.effect, problem.effects_directory)
@@ -245,7 +245,9 @@ def fit(
     if clock and "transport_delay" not in names:
         parameter, believed = effect_named("transport_delay").parameters[0], vehicle.command_delay
         low, high = max(0.0, believed - period), believed + period
-        free.append(Free("transport_delay", parameter, believed, low, high, believed, period, nuisance=True))
+        free.append(
+            FreeParameter("transport_delay", parameter, believed, low, high, believed, period, nuisance=True)
+        )
         chain_names.append("transport_delay")
     effects = [effect_named(n, problem.effects_directory) for n in chain_names]
     measured = problem.measured()
@@ -280,7 +282,7 @@ def fit(
 
 def _minimise(
     residual: Callable[[np.ndarray], np.ndarray],
-    free: Sequence[Free],
+    free: Sequence[FreeParameter],
     weight: np.ndarray,
     neutral: np.ndarray,
     tolerance: float,
@@ -349,7 +351,10 @@ def _bounded_step(
 
 
 def _jacobian(
-    residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, free: Sequence[Free], base: np.ndarray
+    residual: Callable[[np.ndarray], np.ndarray],
+    x: np.ndarray,
+    free: Sequence[FreeParameter],
+    base: np.ndarray,
 ) -> np.ndarray:
     """Forward differences with steps of a hundredth of each prior's width, away from the upper bound."""
     columns = np.empty((base.size, len(x)))
@@ -387,7 +392,7 @@ def robust_covariance(
     return covariance, critical_value(seconds)
 
 
-def long_run_variance(problem: Problem, residual: np.ndarray) -> float:
+def variance_per_independent_sample(problem: Problem, residual: np.ndarray) -> float:
     """Variance of `residual` (K, A) that counts for slow regressors: Bartlett kernel of `HAC_LAG` s, mean over axes,
     and never less than the plain mean square."""
     total, offset = 0.0, 0

@@ -29,7 +29,7 @@ from trueflight.groundstation.identify.fitting import (
     critical_value,
     fit,
     free_parameters,
-    long_run_variance,
+    variance_per_independent_sample,
 )
 from trueflight.groundstation.identify.translation import STRONG_EVIDENCE
 from trueflight.groundstation.measured.measurement import Measurement, measure
@@ -377,7 +377,7 @@ class _Study:
         present = {t.effect for t in self.settled} | set(self.names)
         found: dict[str, Term] = {}
         for name in self.names:
-            needed = self.known[name].with_any
+            needed = self.known[name].acts_through
             if needed and not (present | set(found)) & set(needed):
                 found[needed[0]] = Term(needed[0], self._size(needed[0], diagnosis))
         return tuple(found.values())
@@ -386,8 +386,8 @@ class _Study:
         effect = self.known[name]
         present = {t.effect for t in self.settled}
         names: tuple[str, ...] = (name,)
-        if effect.with_any and not present & set(effect.with_any):
-            through = next((n for n in effect.with_any if n in self.names), effect.with_any[0])
+        if effect.acts_through and not present & set(effect.acts_through):
+            through = next((n for n in effect.acts_through if n in self.names), effect.acts_through[0])
             names = (through, name)
         return _Candidate(names, tuple(self._size(n, diagnosis) for n in names))
 
@@ -431,7 +431,7 @@ class _Study:
         m = measure(diagnosis.flight, diagnosis.bandwidth)
         problem = Problem((m,), self.directory, diagnosis.model.network_chain())
         fitted = fit(problem, list(diagnosis.model.terms), refit=[])
-        return long_run_variance(problem, fitted.residual) * float(np.median(np.diff(m.t)))
+        return variance_per_independent_sample(problem, fitted.residual) * float(np.median(np.diff(m.t)))
 
     # --- the columns ---
 

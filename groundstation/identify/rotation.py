@@ -22,11 +22,11 @@ from trueflight.groundstation.identify.actuation import fit_rate_loop, rate_loop
 from trueflight.groundstation.identify.fitting import (
     BLOCK,
     Fit,
-    Free,
+    FreeParameter,
     block_errors,
     critical_value,
-    long_run_variance,
     robust_covariance,
+    variance_per_independent_sample,
 )
 from trueflight.groundstation.measured.measurement import Rotation, measure_rotation
 from trueflight.groundstation.results import EffectVerdict, ParameterEstimate, RotationalRms
@@ -36,7 +36,7 @@ from trueflight.models.flight import Flight
 from trueflight.models.frames import rotate_inverse
 from trueflight.models.lag import delayed, lagged
 from trueflight.models.model import Term
-from trueflight.models.prediction import act, derivative, motion_of_flight
+from trueflight.models.prediction import apply_effects, derivative, motion_of_flight
 
 FAMILY = 0.01
 """Probability that any rotational effect at all is significant by chance."""
@@ -156,13 +156,13 @@ class TorqueProblem:
     @cached_property
     def control(self) -> np.ndarray:
         """Angular acceleration (K, 3) of the rotors' thrusts without any effect."""
-        return self.columns(act(self.motion, ()).torque)
+        return self.columns(apply_effects(self.motion, ()).torque)
 
     @cached_property
     def nuisances(self) -> list[tuple[str, np.ndarray]]:
         """Name and column (K, 3) of what is fitted beside every effect, apart from the control torque's gains."""
         motion, r = self.motion, self.rotation
-        torque = act(motion, ()).torque / self.inertia
+        torque = apply_effects(motion, ()).torque / self.inertia
         rate, shift = motion.body_rate, derivative(torque, self.rotation.flight.t)
         found = []
         for axis, name in enumerate("xyz"):
@@ -221,7 +221,7 @@ def _as_late_as_it_acts(motion: Motion, rotation: Rotation, inertia: np.ndarray)
     measured = rotation.value[rotation.used][:, :2]
 
     def misfit(x: np.ndarray) -> float:
-        torque = act(acting(*x), ()).torque / inertia
+        torque = apply_effects(acting(*x), ()).torque / inertia
         seen = rotation.smooth(torque[:, :2])[rotation.used]
         seen = seen - seen.mean(axis=0)
         gain = np.sum(seen * measured, axis=0) / np.maximum(np.sum(seen**2, axis=0), 1e-12)
@@ -246,7 +246,7 @@ class _Search:
         self.choices: list[Choice] = []
         for name, effect in effects.items():
             names = tuple(p.name for p in effect.parameters)
-            self.choices += [(name, (n,)) for n in names] if effect.one_of else [(name, names)]
+            self.choices += [(name, (n,)) for n in names] if effect.exclusive else [(name, names)]
         self.significance = FAMILY / max(1, len(self.choices))
         self.blocks = problem.blocks()
         self._columns = {
@@ -265,8 +265,8 @@ class _Search:
         """Angular acceleration (K, 3) of a unit of the parameter: these effects are linear in theirs."""
         neutral = effect.neutral(self.problem.motion.vehicle)
         moved = {**neutral, parameter.name: parameter.typical}
-        with_it = self.problem.columns(act(self.problem.motion, [(effect, moved)]).torque)
-        without = self.problem.columns(act(self.problem.motion, [(effect, neutral)]).torque)
+        with_it = self.problem.columns(apply_effects(self.problem.motion, [(effect, moved)]).torque)
+        without = self.problem.columns(apply_effects(self.problem.motion, [(effect, neutral)]).torque)
         return (with_it - without) / (parameter.typical - neutral[parameter.name])
 
     def fit(self, choices: Sequence[Choice]) -> Fit:
@@ -302,9 +302,12 @@ class _Search:
             x = x + step
             if np.max(np.abs(step) / (np.abs(x) + 1e-6)) < 1e-6:
                 break
-        free = [Free(name, _nuisance(name), 0.0, -np.inf, np.inf, 0.0, nuisance=True) for name, _ in others]
+        free = [
+            FreeParameter(name, _nuisance(name), 0.0, -np.inf, np.inf, 0.0, nuisance=True)
+            for name, _ in others
+        ]
         neutral = {name: self.effects[name].neutral(problem.motion.vehicle) for name, _ in own}
-        free += [Free(name, p, 0.0, p.low, p.high, neutral[name][p.name]) for name, p in own]
+        free += [FreeParameter(name, p, 0.0, p.low, p.high, neutral[name][p.name]) for name, p in own]
         jacobian = -jacobian
         covariance, _ = robust_covariance(problem, jacobian, residual, np.zeros(len(free)))  # type: ignore[arg-type]
         r = problem.rotation
@@ -353,7 +356,7 @@ class _Search:
         )
 
     def _evidence(self, for_: Fit, against: Fit) -> float:
-        unit = long_run_variance(self.problem, for_.residual)  # type: ignore[arg-type]
+        unit = variance_per_independent_sample(self.problem, for_.residual)  # type: ignore[arg-type]
         return (against.sse - for_.sse) / unit
 
     def _plausible(self, fitted: Fit, name: str) -> bool:
@@ -464,7 +467,7 @@ class _Search:
         rest = mine - fitted @ np.linalg.lstsq(fitted, mine, rcond=1e-10)[0]
         energy = float(rest @ rest)
         threshold = stats.chi2.isf(self.significance, len(names)) * (here.critical / 1.96) ** 2
-        unit = long_run_variance(self.problem, here.residual)  # type: ignore[arg-type]
+        unit = variance_per_independent_sample(self.problem, here.residual)  # type: ignore[arg-type]
         power = float(stats.ncx2.sf(threshold, len(names), energy / unit))
         return power > SURE_TO_SEE and energy > MATERIAL_SHARE * here.sse
 

@@ -17,7 +17,7 @@ from trueflight.groundstation.identify.fitting import HAC_LAG, UNMODELLED, Probl
 from trueflight.models.effect import Effect
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
-from trueflight.models.prediction import act, motion_of_flight
+from trueflight.models.prediction import apply_effects, motion_of_flight
 
 PATH = ("motor_lag", "transport_delay", "thrust_curve", "battery_sag")
 """Effects that may act between command and rotor speed."""
@@ -36,7 +36,7 @@ class RotorProblem(Problem):
         parts = []
         for m, motion in zip(self.measurements, self.motions, strict=True):
             level = motion.with_(rotor_thrust=None, torque=None)
-            parts.append(m.smooth(act(level, chain).thrust[:, None])[m.used])
+            parts.append(m.smooth(apply_effects(level, chain).thrust[:, None])[m.used])
         return np.concatenate(parts)
 
     def measured(self) -> np.ndarray:
@@ -79,7 +79,7 @@ def thrust_from_rotors(flight: Flight) -> Flight:
         )
     vehicle = flight.vehicle
     squares = np.sum(flight.rotor_speed**2, axis=1)  # type: ignore[operator]
-    believed = act(motion_of_flight(replace(flight, quaternion=None)), ()).thrust * vehicle.mass
+    believed = apply_effects(motion_of_flight(replace(flight, quaternion=None)), ()).thrust * vehicle.mass
     flying = np.ones(len(flight), dtype=bool) if flight.flying is None else flight.flying
     ratio = believed / vehicle.weight
     near = flying & (ratio > NEAR_HOVER[0]) & (ratio < NEAR_HOVER[1]) & (squares > 0.0)

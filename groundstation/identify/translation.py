@@ -21,9 +21,9 @@ from trueflight.groundstation.identify.fitting import (
     block_errors,
     fit,
     free_parameters,
-    long_run_variance,
     model_of,
     robust_covariance,
+    variance_per_independent_sample,
     with_clock,
 )
 from trueflight.groundstation.identify.remainder import unexplained
@@ -181,7 +181,7 @@ class _Search:
             terms = [*self.base.terms, *self.rotation.terms, *(Term(n, start.get(n, {})) for n in free)]
             terms = self._placed(terms, added)
             fitted = fit(self.problem, terms, refit=free)
-            if through := [n for n in added if self.known[n].with_any]:
+            if through := [n for n in added if self.known[n].acts_through]:
                 # what acts through another can balance it far from the best fit: begin once more from "none of it"
                 other = fit(self.problem, self._anew(terms, through), refit=free)
                 fitted = other if self._evidence(other, fitted) > 0.0 else fitted
@@ -190,7 +190,7 @@ class _Search:
 
     def _anew(self, terms: list[Term], through: Sequence[str]) -> list[Term]:
         """`terms` with the effects `through` at none of it, and those that they act through at their typical size."""
-        carriers = {n for name in through for n in self.known[name].with_any} - set(self.base.names())
+        carriers = {n for name in through for n in self.known[name].acts_through} - set(self.base.names())
         values = {n: self.known[n].typical(self.problem.survey) for n in carriers}
         values |= {n: self._at_rest(self.known[n]) for n in through}
         return [replace(t, values=values.get(t.effect, t.values)) for t in terms]
@@ -265,7 +265,7 @@ class _Search:
         for name in self.candidates:
             if name in present:
                 continue
-            needed = self.known[name].with_any
+            needed = self.known[name].acts_through
             if not needed or present & set(needed):
                 steps.append((name,))
             else:
@@ -352,7 +352,7 @@ class _Search:
     def _shows(self, candidate: _State, name: str) -> bool:
         """Whether the flight tells the effect from the simpler ones it may coincide with: at its typical size beyond
         them, or at its fitted size better than they do in its place."""
-        beyond = [n for n in self.known[name].beyond if n in self.candidates or n in self.base.names()]
+        beyond = [n for n in self.known[name].generalises if n in self.candidates or n in self.base.names()]
         if not beyond:
             return True
         mine = self._contribution(candidate, name).sum(axis=1)
@@ -368,7 +368,7 @@ class _Search:
     def _power(self, current: _State, energy: float, count: int) -> float:
         """Probability that `count` parameters are significant when what they change has this squared sum."""
         threshold = stats.chi2.isf(self.significance, count) * (current.fit.critical / 1.96) ** 2
-        unit = long_run_variance(self.problem, current.fit.residual)
+        unit = variance_per_independent_sample(self.problem, current.fit.residual)
         return float(stats.ncx2.sf(threshold, count, energy / unit))
 
     def _evident(self, with_: _State, without: _State) -> bool:
@@ -424,7 +424,9 @@ class _Search:
         rest = tuple(n for n in current.added if n != name)
         present = {*self.base.names(), *rest}
         return self.state(
-            tuple(n for n in rest if not self.known[n].with_any or present & set(self.known[n].with_any))
+            tuple(
+                n for n in rest if not self.known[n].acts_through or present & set(self.known[n].acts_through)
+            )
         )
 
     def _agrees_with_held_out(self, current: _State) -> _State:
@@ -474,11 +476,12 @@ class _Search:
         if name in {t.effect for t in self.on_the_way}:
             return  # the rotors themselves show it
         for rival in self.candidates:
-            needed = self.known[rival].with_any
+            needed = self.known[rival].acts_through
             if rival in current.added or (needed and not present & set(needed)):
                 continue
             if any(
-                self.known[n].with_any and not {*present, rival} & set(self.known[n].with_any) for n in rest
+                self.known[n].acts_through and not {*present, rival} & set(self.known[n].acts_through)
+                for n in rest
             ):
                 continue
             if not self._cannot_stand_in(current, name, rival):
@@ -488,15 +491,15 @@ class _Search:
         """Whether the linearised rival takes away so little of what the effect does that no fit need be made."""
         without = self._without(current, name)
         lost = without.fit.sse - current.fit.sse
-        unit = long_run_variance(self.problem, current.fit.residual)
+        unit = variance_per_independent_sample(self.problem, current.fit.residual)
         near = LINEARISED * self._screen(without, (rival,))
         return near < lost and (lost - near) / unit > LINEARISED * STRONG_EVIDENCE
 
     def _evidence(self, for_: Fit, against: Fit) -> float:
         """Evidence for one fit against another with as many effects, on the scale of twice a log likelihood ratio:
         squared error in units of one independent sample, and the distance of the parameters from "no effect"."""
-        unit = long_run_variance(self.problem, for_.residual)
-        return (against.sse - for_.sse) / unit + against.surprise - for_.surprise
+        unit = variance_per_independent_sample(self.problem, for_.residual)
+        return (against.sse - for_.sse) / unit + against.prior_penalty - for_.prior_penalty
 
     def report(self, current: _State, whole: _Search) -> Diagnosis:
         """The verdicts; figures of what was found are those of the whole flight, which `whole` sees."""
@@ -626,8 +629,8 @@ class _Search:
         effect = self.known[name]
         present = {*self.base.names(), *current.added}
         through = None
-        if effect.with_any and not present & set(effect.with_any):
-            through = next((n for n in effect.with_any if n in self.candidates), None)
+        if effect.acts_through and not present & set(effect.acts_through):
+            through = next((n for n in effect.acts_through if n in self.candidates), None)
             if through is None:
                 return self._judge_unmeasured(effect)
             extended = self.state((*current.added, through, name)).fit
@@ -684,7 +687,7 @@ class _Search:
     def _judge_unmeasured(self, effect: Effect) -> EffectVerdict:
         """The verdict on an effect whose measurements the flight lacks."""
         missing = effect.lacks(self.flight)
-        through = f" and one of {', '.join(effect.with_any)} in the model" if effect.with_any else ""
+        through = f" and one of {', '.join(effect.acts_through)} in the model" if effect.acts_through else ""
         advice = (
             f"needs {', '.join(missing) or 'measurements'}{through}; record it, and fly {effect.manoeuvre}"
         )

@@ -24,7 +24,7 @@ from trueflight.models.features import feature_names
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model
 from trueflight.models.network import features_of_motion
-from trueflight.models.prediction import act, motion_of_flight, specific_force
+from trueflight.models.prediction import apply_effects, motion_of_flight, specific_force
 
 VALIDATION_SHARE = 1.0 / 3.0
 """Of the samples, as in the paper."""
@@ -150,9 +150,11 @@ def _of_flight(
     measurement = measure(flight, bandwidth, thin=False)
     motion = motion_of_flight(flight)
     chain = with_clock(measure(flight, bandwidth), model.effect_chain())
-    base = measurement.see(specific_force(act(motion, chain)))
+    base = measurement.see(specific_force(apply_effects(motion, chain)))
     target = heading_acceleration(motion, measurement.value) - heading_acceleration(motion, base)
-    delivered = act(motion, [(effect, values) for effect, values in chain if effect.stage is Stage.COMMAND])
+    delivered = apply_effects(
+        motion, [(effect, values) for effect, values in chain if effect.stage is Stage.COMMAND]
+    )
     features = measurement.smooth(np.asarray(features_of_motion(delivered, names)))
     used = measurement.used & np.all(np.isfinite(target), axis=1) & np.all(np.isfinite(features), axis=1)
     touching = ndimage.binary_dilation(

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 
-class Told:
+class CitedValue:
     """A part of the JSON table that knows its place in it.
 
     Texts stand as they are; a number has to go through the filter `num`, which says how it is written.
@@ -24,15 +24,15 @@ class Told:
     def __init__(self, raw: Any, path: str = "") -> None:
         self._raw, self._path = raw, path
 
-    def __getitem__(self, key: str | int) -> Told:
-        return Told(self._raw[key], f"{self._path}.{key}" if self._path else str(key))
+    def __getitem__(self, key: str | int) -> CitedValue:
+        return CitedValue(self._raw[key], f"{self._path}.{key}" if self._path else str(key))
 
-    def __getattr__(self, name: str) -> Told:
+    def __getattr__(self, name: str) -> CitedValue:
         if isinstance(self._raw, dict) and name in self._raw:
             return self[name]
         raise AttributeError(f"nothing is told of '{self._path}.{name}'")
 
-    def __iter__(self) -> Iterator[Told]:
+    def __iter__(self) -> Iterator[CitedValue]:
         return (self[k] for k in range(len(self._raw)))
 
     def __len__(self) -> int:
@@ -42,7 +42,7 @@ class Told:
         return bool(self._raw)
 
     def __eq__(self, other: object) -> bool:
-        return bool(self._raw == (other._raw if isinstance(other, Told) else other))
+        return bool(self._raw == (other._raw if isinstance(other, CitedValue) else other))
 
     def __hash__(self) -> int:
         return hash(self._path)
@@ -58,7 +58,7 @@ class Told:
     def __html__(self) -> str:
         return str(Markup('<span data-path="{}">{}</span>').format(self._path, str(self)))
 
-    def each(self) -> Iterator[tuple[str, Told]]:
+    def each(self) -> Iterator[tuple[str, CitedValue]]:
         """Key and value of each entry."""
         return ((key, self[key]) for key in self._raw)
 
@@ -80,17 +80,17 @@ def written(value: float | None, spec: str, scale: float = 1.0) -> str:
     return mantissa.replace("-", "−") + power
 
 
-def _as_html(told: Told, spec: str, scale: float = 1.0) -> Markup:
+def _as_html(told: CitedValue, spec: str, scale: float = 1.0) -> Markup:
     return Markup('<data value="{}" data-path="{}" data-spec="{}" data-scale="{}">{}</data>').format(
         json.dumps(told._raw), told._path, spec, f"{scale:g}", written(told._raw, spec, scale)
     )
 
 
-def _as_text(told: Told, spec: str, scale: float = 1.0) -> str:
+def _as_text(told: CitedValue, spec: str, scale: float = 1.0) -> str:
     return written(told._raw, spec, scale)
 
 
-def _interval(number: Callable[..., str], parameter: Told) -> str:
+def _interval(number: Callable[..., str], parameter: CitedValue) -> str:
     """A parameter with its unit and interval, to two digits of the interval's width."""
     low, high = parameter._raw["low"], parameter._raw["high"]
     width = high - low
@@ -104,17 +104,17 @@ def _interval(number: Callable[..., str], parameter: Told) -> str:
 UNITS = {"m/s^2": "m/s²", "rad/s^2": "rad/s²", "m^2": "m²", "1": ""}
 
 
-def unit(told: Told | str) -> str:
+def unit(told: CitedValue | str) -> str:
     """A unit as people write it, with the space before it; nothing for a bare number."""
     name = str(told)
     name = UNITS.get(name, name)
     return f" {name}" if name else ""
 
 
-def _code(text: Told | str) -> Markup:
+def _code(text: CitedValue | str) -> Markup:
     """A text with what stands after "groundstation" as code."""
     found = re.sub(r"(groundstation [a-z_ -]+[a-z_])", r"<code>\1</code>", str(escape(str(text))))
-    if isinstance(text, Told):
+    if isinstance(text, CitedValue):
         return Markup('<span data-path="{}">{}</span>').format(text._path, Markup(found))
     return Markup(found)
 
@@ -138,6 +138,6 @@ def environment(html: bool) -> Environment:
 
 def sentences(table: dict[str, Any], html: bool) -> list[str]:
     """The verdict of an analysis (its JSON table) in plain words, the outcome first."""
-    text = environment(html).get_template("verdict.txt").render(t=Told(table))
+    text = environment(html).get_template("verdict.txt").render(t=CitedValue(table))
     lines = [" ".join(line.split()) for line in text.splitlines()]
     return [Markup(line) if html else line for line in lines if line]

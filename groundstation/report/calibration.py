@@ -13,7 +13,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from trueflight.groundstation.evaluate.calibration import NOTHING, OUTCOMES
-from trueflight.groundstation.output.cited import Told, environment
+from trueflight.groundstation.output.cited import CitedValue, environment
 from trueflight.groundstation.report.page import write_report
 from trueflight.groundstation.report.svg import COLOURS, LIGHT, figure, light_style, style, to_svg
 from trueflight.models.whole_file import whole_file
@@ -278,7 +278,7 @@ CHARTS: tuple[Chart, ...] = (
 
 def render_calibration(table: Table) -> str:
     """The page as HTML. `table` is the JSON of the study."""
-    html, told = environment(html=True), Told(table)
+    html, told = environment(html=True), CitedValue(table)
     bodies = []
     with style():
         for chart in CHARTS:

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from trueflight.groundstation.evaluate.analysis import Analysis
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
-from trueflight.groundstation.output.cited import Told, environment, sentences
+from trueflight.groundstation.output.cited import CitedValue, environment, sentences
 from trueflight.groundstation.report import charts
 from trueflight.groundstation.report.svg import style
 from trueflight.models.errors import InputError
@@ -89,7 +89,7 @@ def chosen(without: Sequence[str]) -> tuple[Section, ...]:
 
 def render(analysis: Analysis, table: Table, sections: Sequence[Section] = SECTIONS) -> str:
     """The page as HTML. `table` is the JSON of `analysis`: every number in the page is read from it."""
-    html, told = environment(html=True), Told(table)
+    html, told = environment(html=True), CitedValue(table)
     with style():
         bodies = [
             (section, _body(html, section, section.charts(analysis, table), told))
@@ -107,7 +107,7 @@ def render(analysis: Analysis, table: Table, sections: Sequence[Section] = SECTI
 def render_side_by_side(beside: SideBySide, table: Table) -> str:
     """A page of comparisons side by side alone; `table` holds their JSON under "side_by_side", and
     "provenance"."""
-    html, told = environment(html=True), Told(table)
+    html, told = environment(html=True), CitedValue(table)
     wanted = {s.name: s for s in SECTIONS}
     with style():
         drawn = _beside(beside, table)
@@ -121,7 +121,7 @@ def render_side_by_side(beside: SideBySide, table: Table) -> str:
     return html.get_template("report.html").render(t=told, verdict=verdict, title=title, sections=bodies)
 
 
-def _body(html: Any, section: Section, drawn: Charts, told: Told) -> Markup:
+def _body(html: Any, section: Section, drawn: Charts, told: CitedValue) -> Markup:
     return Markup(html.get_template(section.template).render(t=told, chart=drawn))
 
 

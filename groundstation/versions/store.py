@@ -109,8 +109,10 @@ def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: f
     known = effect_named(effect, base.effects_directory)
     if effect in base.names():
         raise InputError(f"{effect} is in {base.label} already; 'model refit' fits its parameters anew")
-    if known.with_any and not set(known.with_any) & set(base.names()):
-        raise InputError(f"{effect} acts only through {' or '.join(known.with_any)}; add one of these first")
+    if known.acts_through and not set(known.acts_through) & set(base.names()):
+        raise InputError(
+            f"{effect} acts only through {' or '.join(known.acts_through)}; add one of these first"
+        )
     for flight in flights:
         for column in known.needs:
             flight.column(column)

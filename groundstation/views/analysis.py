@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 
 from trueflight.groundstation.evaluate.analysis import Analysis
 from trueflight.groundstation.output.as_json import analysis_table
-from trueflight.groundstation.output.cited import Told, environment, sentences
+from trueflight.groundstation.output.cited import CitedValue, environment, sentences
 from trueflight.groundstation.views.bars import bar_groups
 from trueflight.groundstation.views.colour import NEWEST, WARNING, Colour, of_version
 from trueflight.groundstation.views.comparison import comparison_panel
@@ -53,7 +53,7 @@ def _verdict(stream: rr.RecordingStream, a: Analysis, table: dict[str, Any]) -> 
     """Plain words and the ranking, the share of each effect, the waterfall, the error over time."""
     markdown = environment(html=False)
     words = sentences(table, html=False)
-    told = Told(table)
+    told = CitedValue(table)
     text(stream, "verdict/words", "\n\n".join([f"## {words[0]}", *words[1:]]))
     text(stream, "verdict/ranking", markdown.get_template("ranking.md").render(t=told))
     text(stream, "verdict/about", markdown.get_template("about.md").render(t=told))

@@ -22,5 +22,5 @@ EFFECT = Effect(
     manoeuvre="one flight from a full to a nearly empty battery, or flights on both",
     citation="duty cycle times voltage drives the motor, thrust goes with rotor speed squared (Bangura & Mahony 2014)",
     confounded_with=("thrust_gain",),
-    beyond=("thrust_gain",),
+    generalises=("thrust_gain",),
 )

@@ -67,7 +67,7 @@ EFFECT = Effect(
     citation="Sanchez-Cuevas, Heredia, Ollero 2017 (ICUAS, bridge inspection by contact), thrust ratio in ceiling "
     "effect; Powers et al. 2013",
     confounded_with=("thrust_gain", "ground_effect", "axial_inflow"),
-    beyond=("thrust_gain",),
+    generalises=("thrust_gain",),
     typical_for=just_above,
     starts_for=heights,
 )

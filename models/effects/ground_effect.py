@@ -35,5 +35,5 @@ EFFECT = Effect(
     manoeuvre="slow passes and hovers at heights from half a rotor radius above the ground to five radii",
     citation="Cheeseman & Bennett 1955; Danjun et al. 2015; Sanchez-Cuevas et al. 2017 (quadrotors)",
     confounded_with=("thrust_gain",),
-    beyond=("thrust_gain",),
+    generalises=("thrust_gain",),
 )

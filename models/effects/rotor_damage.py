@@ -41,5 +41,5 @@ EFFECT = Effect(
     needs_any=("rotor_speed", "motor_command"),
     rotational=True,
     seen_as=("thrust_gain",),
-    one_of=True,
+    exclusive=True,
 )

@@ -23,5 +23,5 @@ EFFECT = Effect(
     manoeuvre="vertical accelerations up and down, from half to one and a half times the hover thrust",
     citation="second-order expansion about hover of the blend of linear and square, as PX4's THR_MDL_FAC",
     confounded_with=("thrust_gain", "accelerometer_bias"),
-    beyond=("thrust_gain",),
+    generalises=("thrust_gain",),
 )

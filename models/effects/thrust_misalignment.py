@@ -28,5 +28,5 @@ EFFECT = Effect(
     "(Carvalho et al. 2022, eq. (1)-(3)) with a mounting error of motors or of the autopilot",
     confounded_with=("accelerometer_bias", "wind", "rotor_drag"),
     aliases=("mounting of the autopilot",),
-    beyond=("accelerometer_bias",),
+    generalises=("accelerometer_bias",),
 )

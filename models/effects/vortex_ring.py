@@ -49,5 +49,5 @@ EFFECT = Effect(
     citation="Leishman, Principles of Helicopter Aerodynamics, sec. 2.13 (rotor in axial descent); "
     "Shetty & Selig 2011 (AIAA 2011-1254; small propellers lose up to a third of their thrust); bump by the authors",
     confounded_with=("axial_inflow", "parasitic_drag"),
-    beyond=("axial_inflow",),
+    generalises=("axial_inflow",),
 )

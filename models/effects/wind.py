@@ -27,5 +27,5 @@ EFFECT = Effect(
     manoeuvre="translations in all directions and a slow full turn in yaw",
     citation="drag follows the velocity relative to the air",
     confounded_with=("accelerometer_bias", "rotor_drag", "parasitic_drag"),
-    with_any=("rotor_drag", "parasitic_drag"),
+    acts_through=("rotor_drag", "parasitic_drag"),
 )

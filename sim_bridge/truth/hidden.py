@@ -51,7 +51,7 @@ class Hidden:
         }
 
 
-class Effect:
+class TruthEffect:
     """A hidden effect: `size` is its main number, between `low` and `high` when drawn.
 
     `units` names every parameter of the effect with its unit, the first being the size.
@@ -98,17 +98,17 @@ class Effect:
         return None
 
 
-EFFECTS: dict[str, Effect] = {}
+EFFECTS: dict[str, TruthEffect] = {}
 
 
-def register(effect: type[Effect]) -> type[Effect]:
+def register(effect: type[TruthEffect]) -> type[TruthEffect]:
     """Make an effect known by its name."""
     EFFECTS[effect.name] = effect()
     return effect
 
 
 @register
-class ThrustGain(Effect):
+class ThrustGain(TruthEffect):
     """Other propellers than believed: every rotor's thrust constant is off by one factor."""
 
     name, what = "thrust_gain", "thrust of every rotor is off by a factor"
@@ -133,7 +133,7 @@ class ThrustGain(Effect):
 
 
 @register
-class ThrustCurve(Effect):
+class ThrustCurve(TruthEffect):
     """The speed controller turns commands into rotor speed by another curve, with the same hover."""
 
     name, what = "thrust_curve", "the map from command to rotor speed is another curve, right at hover only"
@@ -146,7 +146,7 @@ class ThrustCurve(Effect):
 
 
 @register
-class BatterySag(Effect):
+class BatterySag(TruthEffect):
     """Rotor speed is not regulated: thrust follows a power of the voltage."""
 
     name, what = "battery_sag", "thrust follows a power of the battery's voltage over the nominal one"
@@ -169,7 +169,7 @@ class BatterySag(Effect):
 
 
 @register
-class MotorLag(Effect):
+class MotorLag(TruthEffect):
     """Rotors take longer to change speed than measured on the bench."""
 
     name, what = "motor_lag", "the rotors' speed lags its command with another time constant"
@@ -192,7 +192,7 @@ class MotorLag(Effect):
 
 
 @register
-class TransportDelay(Effect):
+class TransportDelay(TruthEffect):
     """Setpoints reach the motors later than believed."""
 
     name, what = "transport_delay", "setpoints reach the motors later than believed, by this much more"
@@ -205,7 +205,7 @@ class TransportDelay(Effect):
 
 
 @register
-class RotorDrag(Effect):
+class RotorDrag(TruthEffect):
     """H-force of each rotor, proportional to its speed and to the air's velocity at its hub, in the rotor
     plane.
 
@@ -262,7 +262,7 @@ def rotor_drag(airframe: Airframe, x_per_s: float, y_per_s: float) -> Act:
 
 
 @register
-class ParasiticDrag(Effect):
+class ParasiticDrag(TruthEffect):
     """Dynamic pressure on the frame, with an area of its own along each body axis.
 
     Source: Hoerner, "Fluid-Dynamic Drag", 1965: drag 0.5 rho C_D A |V| V.
@@ -302,7 +302,7 @@ class ParasiticDrag(Effect):
 
 
 @register
-class GroundEffect(Effect):
+class GroundEffect(TruthEffect):
     """Each rotor feels the images of all four below the ground, at the heights that the attitude gives their
     hubs.
 
@@ -360,7 +360,7 @@ class GroundEffect(Effect):
 
 
 @register
-class Wind(Effect):
+class Wind(TruthEffect):
     """Steady wind. It acts through drag: where no drag is hidden with it, the rotors drag as known for such
     frames.
     """
@@ -386,7 +386,7 @@ class Wind(Effect):
 
 
 @register
-class AccelerometerBias(Effect):
+class AccelerometerBias(TruthEffect):
     """The accelerometer reads a constant in body axes."""
 
     name, what = "accelerometer_bias", "the accelerometer reads a constant off, in body axes"
@@ -410,7 +410,7 @@ class AccelerometerBias(Effect):
 
 
 @register
-class EstimatorDelay(Effect):
+class EstimatorDelay(TruthEffect):
     """Sensors, filters, estimator and link take time: a companion is told of a moment this much later.
 
     The messages carry the time of the moment that they tell of. The autopilot's own loops are not late: they
@@ -434,7 +434,7 @@ class EstimatorDelay(Effect):
 
 
 @register
-class Payload(Effect):
+class Payload(TruthEffect):
     """A load picked up in flight: more mass and inertia from a time after take-off until the motors stop.
 
     A cube as wide as a rotor's radius, its centre in the centre of mass, so that no torque comes with it. An
@@ -458,7 +458,7 @@ class Payload(Effect):
 
 
 @register
-class TranslationalLift(Effect):
+class TranslationalLift(TruthEffect):
     """Blade elements of a rotor in edgewise flow meet faster air on one side than they miss on the other.
 
     Averaged over a turn the square of a blade element's airspeed grows by half the square of the edgewise airspeed:
@@ -491,7 +491,7 @@ class TranslationalLift(Effect):
 
 
 @register
-class CeilingEffect(Effect):
+class CeilingEffect(TruthEffect):
     """A ceiling above the flight draws each rotor up.
 
     Law and constants of Sanchez-Cuevas, Heredia and Ollero, "Multirotor UAS for bridge inspection by contact using
@@ -528,7 +528,7 @@ class CeilingEffect(Effect):
 
 
 @register
-class VortexRing(Effect):
+class VortexRing(TruthEffect):
     """A rotor that sinks into its own wake loses thrust.
 
     A raised cosine over the descent speed of each hub, from 0.3 to 1.5 of the hover's induced velocity, as the loss of
@@ -564,7 +564,7 @@ class VortexRing(Effect):
 
 
 @register
-class ThrustMisalignment(Effect):
+class ThrustMisalignment(TruthEffect):
     """Rotors are mounted with a common tilt against the autopilot."""
 
     name, what = "thrust_misalignment", "every rotor's axis leans by the same angle against the body"
@@ -600,7 +600,7 @@ class ThrustMisalignment(Effect):
 
 
 @register
-class ImuLeverArm(Effect):
+class ImuLeverArm(TruthEffect):
     """The accelerometer sits away from the centre of mass and reads the acceleration of where it sits."""
 
     name, what = "imu_lever_arm", "the accelerometer sits away from the centre of mass"
@@ -628,7 +628,7 @@ class ImuLeverArm(Effect):
 
 
 @register
-class CentreOfMassOffset(Effect):
+class CentreOfMassOffset(TruthEffect):
     """The battery slipped: the centre of mass is not where the rotors' positions are measured from."""
 
     name, what = (
@@ -664,7 +664,7 @@ class CentreOfMassOffset(Effect):
 
 
 @register
-class RotorDamage(Effect):
+class RotorDamage(TruthEffect):
     """A chipped propeller: one rotor gives less thrust, and drags less, at the same speed."""
 
     name, what = "rotor_damage", "one rotor gives less thrust than the others at the same speed"
@@ -685,7 +685,7 @@ class RotorDamage(Effect):
 
 
 @register
-class RateLoopLag(Effect):
+class RateLoopLag(TruthEffect):
     """The autopilot filters the commanded body rates."""
 
     name, what = "rate_loop_lag", "body rates follow their command through a further lag"
@@ -698,7 +698,7 @@ class RateLoopLag(Effect):
 
 
 @register
-class Gyroscopic(Effect):
+class Gyroscopic(TruthEffect):
     """Rotors have angular momentum: turning their axes and changing their speed takes torque from the body.
 
     The momentum of all rotors along the body's z axis, J sum s_i W_i, changes with the body's rates and with the

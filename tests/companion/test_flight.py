@@ -16,7 +16,7 @@ from trueflight.companion.flight import (
     MISSION,
     SILENT,
     TAKEOFF,
-    Flight,
+    FlightStateMachine,
     Mission,
     Outcome,
     Safety,
@@ -64,7 +64,9 @@ class Rig:
 
     def __post_init__(self) -> None:
         law = ControlLaw(VEHICLE, DESIGN)
-        self.flight = Flight(law, self.safety, lambda level, kind, text: self.events.append((kind, text)))
+        self.flight = FlightStateMachine(
+            law, self.safety, lambda level, kind, text: self.events.append((kind, text))
+        )
 
     def tick(self, dt_us: int = DT_US) -> Outcome:
         self.time_us += dt_us

@@ -16,7 +16,7 @@ from test_companion_cli import companion
 
 from trueflight.companion.message_rates import odometry_too_low
 from trueflight.companion.pose import PoseSettings
-from trueflight.companion.preflight import hover_of, judge, wishes
+from trueflight.companion.preflight import hover_of, judge, required_parameters
 from trueflight.companion.settings import Settings
 from trueflight.companion.vehicle_link import Rates
 
@@ -124,31 +124,31 @@ class TestWishes:
     """What is wanted depends on how the vehicle is to fly."""
 
     def names(self, settings: Settings) -> set[str]:
-        return {wish.name for wish in wishes(settings)}
+        return {required.name for required in required_parameters(settings)}
 
     def test_a_fast_loop_wants_a_fast_estimator(self) -> None:
         assert "EKF2_PREDICT_US" not in self.names(Settings(rate=100.0))
-        (wish,) = [w for w in wishes(Settings(rate=250.0)) if w.name == "EKF2_PREDICT_US"]
-        assert wish.good(4000)
-        assert not wish.good(10000)
-        assert wish.change(10000) == 4000
-        assert wish.reboot
+        (required,) = [w for w in required_parameters(Settings(rate=250.0)) if w.name == "EKF2_PREDICT_US"]
+        assert required.good(4000)
+        assert not required.good(10000)
+        assert required.change(10000) == 4000
+        assert required.reboot
 
     def test_mocap_wants_the_estimator_to_use_it(self) -> None:
         settings = Settings(pose=PoseSettings(enabled=True))
         assert {"EKF2_EV_CTRL", "EKF2_HGT_REF", "EKF2_GPS_CTRL"} <= self.names(settings)
         assert "EKF2_EV_CTRL" not in self.names(Settings())
-        (wish,) = [w for w in wishes(settings) if w.name == "EKF2_EV_CTRL"]
-        assert wish.good(11)
-        assert wish.good(15)
-        assert not wish.good(4)
-        assert wish.change(4) == 15, "what somebody set besides stays"
+        (required,) = [w for w in required_parameters(settings) if w.name == "EKF2_EV_CTRL"]
+        assert required.good(11)
+        assert required.good(15)
+        assert not required.good(4)
+        assert required.change(4) == 15, "what somebody set besides stays"
 
     def test_every_change_is_good(self) -> None:
-        for wish in wishes(Settings(rate=250.0, pose=PoseSettings(enabled=True))):
+        for required in required_parameters(Settings(rate=250.0, pose=PoseSettings(enabled=True))):
             for value in (-1, 0, 1, 7, 20000):
-                change = wish.change(value)
-                assert change is None or wish.good(change), wish.name
+                change = required.change(value)
+                assert change is None or required.good(change), required.name
 
 
 def ticks(seconds: float, thrust: float, speed: float = 0.0, tilt: float = 0.0) -> dict[str, np.ndarray]:
@@ -190,12 +190,16 @@ class _Autopilot:
 
 
 def test_a_parameter_that_a_release_renamed_is_looked_for_under_its_new_name() -> None:
-    wish = next(wish for wish in wishes(Settings()) if wish.name == "COM_RC_OVERRIDE")
-    old = judge(_Autopilot({"COM_RC_OVERRIDE": 1}), wish)  # type: ignore[arg-type]
-    new = judge(_Autopilot({"MAN_OVERRIDE_SPD": -1.0}), wish)  # type: ignore[arg-type]
+    required = next(
+        required for required in required_parameters(Settings()) if required.name == "COM_RC_OVERRIDE"
+    )
+    old = judge(_Autopilot({"COM_RC_OVERRIDE": 1}), required)  # type: ignore[arg-type]
+    new = judge(_Autopilot({"MAN_OVERRIDE_SPD": -1.0}), required)  # type: ignore[arg-type]
     assert (old.name, old.value, old.change) == ("COM_RC_OVERRIDE", "1", 3)
     assert (new.name, new.state, new.change) == ("MAN_OVERRIDE_SPD", "warn", 1.0)
-    assert judge(_Autopilot({"MAN_OVERRIDE_SPD": 1.0}), wish).state == "ok"  # type: ignore[arg-type]
-    assert judge(_Autopilot({}), wish).state == "note"  # type: ignore[arg-type]
-    wish = next(wish for wish in wishes(Settings()) if wish.name == "EKF2_NOAID_TOUT")
-    assert judge(_Autopilot({"EKF2_NOAID_TOUT": 5_000_000}), wish).value == "5000000"  # type: ignore[arg-type]
+    assert judge(_Autopilot({"MAN_OVERRIDE_SPD": 1.0}), required).state == "ok"  # type: ignore[arg-type]
+    assert judge(_Autopilot({}), required).state == "note"  # type: ignore[arg-type]
+    required = next(
+        required for required in required_parameters(Settings()) if required.name == "EKF2_NOAID_TOUT"
+    )
+    assert judge(_Autopilot({"EKF2_NOAID_TOUT": 5_000_000}), required).value == "5000000"  # type: ignore[arg-type]

@@ -21,7 +21,7 @@ from trueflight.groundstation.evaluate.bound import (
     memory,
     predict_tube,
     smallest_ball,
-    tube,
+    stability_tube,
 )
 from trueflight.groundstation.evaluate.tracking import read_designed
 from trueflight.models.design import load_design
@@ -69,7 +69,7 @@ def test_no_bounded_disturbance_takes_the_state_out_of_its_tube(p, zeta, seed, k
     level = ball.level(states)
     radius, bound = memory(d, ball.decay, DT).max(), np.abs(d).max()
     assert radius <= bound * (1 + 1e-12)
-    allowed = tube(ball, radius, bound, DT * np.arange(n), level[0], jumps)
+    allowed = stability_tube(ball, radius, bound, DT * np.arange(n), level[0], jumps)
     assert np.all(level <= allowed * (1 + 1e-9) + 1e-12)
     # The tube's extent in position and velocity holds as well, each on its own.
     assert np.all(np.abs(states) <= allowed[:, None] * [ball.position, ball.velocity] * (1 + 1e-9) + 1e-12)

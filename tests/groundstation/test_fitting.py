@@ -40,10 +40,10 @@ def flight(seed: int, colour: float, seconds: float = 30.0, noise: float = 0.15)
         thrust_command=0.5 * thrust / GRAVITY,
     )
     from trueflight.models.effects import effect_named
-    from trueflight.models.prediction import act, motion_of_flight, specific_force
+    from trueflight.models.prediction import apply_effects, motion_of_flight, specific_force
 
     chain = [(effect_named("rigid_body"), {}), (effect_named("rotor_drag"), {"x": DRAG, "y": DRAG})]
-    truth = specific_force(act(motion_of_flight(made), chain))
+    truth = specific_force(apply_effects(motion_of_flight(made), chain))
     return Flight(**{**made.__dict__, "specific_force": truth + coloured})
 
 

@@ -24,7 +24,7 @@ from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.frames import quaternion_from_euler
 from trueflight.models.model import Term, rigid_body_model
-from trueflight.models.prediction import act, motion_of_flight, specific_force
+from trueflight.models.prediction import apply_effects, motion_of_flight, specific_force
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import GRAVITY, Vehicle, load_vehicle
 from trueflight.sim_bridge.in_process import Plan, record
@@ -231,7 +231,7 @@ def test_made_effect_is_found_and_its_interval_holds_the_truth(name: str) -> Non
     make, values = (MADE | NOT_HIDDEN)[name]
     flight = make()
     chain = [(effect_named("rigid_body"), {}), (effect_named(name), values)]
-    truth = specific_force(act(motion_of_flight(flight), chain))
+    truth = specific_force(apply_effects(motion_of_flight(flight), chain))
     flight = replace(flight, specific_force=truth + flight.specific_force)
     assert diagnosis(flight).named("missing") == (name,)
     fitted = fit(Problem((measure(flight),)), [Term("rigid_body", {}), Term(name, {})])

@@ -14,7 +14,7 @@ import pytest
 from trueflight.groundstation.evaluate.analysis import analyse
 from trueflight.groundstation.evaluate.side_by_side import side_by_side, told_apart
 from trueflight.groundstation.output.as_json import analysis_table
-from trueflight.groundstation.output.cited import Told, environment, sentences, written
+from trueflight.groundstation.output.cited import CitedValue, environment, sentences, written
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.report import SECTIONS, chosen, render, write_report
 from trueflight.groundstation.views import write_analysis
@@ -148,9 +148,9 @@ def test_no_number_is_written_into_the_templates():
 
 def test_a_number_cannot_slip_into_a_page_unformatted(table):
     with pytest.raises(TypeError, match=r"residual_rms\.before"):
-        environment(True).from_string("{{ t.residual_rms.before }}").render(t=Told(table))
+        environment(True).from_string("{{ t.residual_rms.before }}").render(t=CitedValue(table))
     with pytest.raises(Exception, match="no attribute 'befor'"):
-        environment(True).from_string("{{ t.residual_rms.befor | num('.3f') }}").render(t=Told(table))
+        environment(True).from_string("{{ t.residual_rms.befor | num('.3f') }}").render(t=CitedValue(table))
 
 
 def test_the_page_needs_nothing_else_and_is_accessible(page):

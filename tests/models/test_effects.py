@@ -14,7 +14,7 @@ from trueflight.models.effects import catalogue, effect_named
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS, Flight
 from trueflight.models.frames import quaternion_from_euler
-from trueflight.models.prediction import act, motion_of_flight, specific_force
+from trueflight.models.prediction import apply_effects, motion_of_flight, specific_force
 from trueflight.models.vehicle import GRAVITY, Vehicle
 
 VEHICLE = Vehicle(
@@ -61,7 +61,7 @@ def sample(phi: float, theta: float, psi: float, v: tuple, u: float, z: float, v
 def reading(flight: Flight, *chain: tuple[str, dict[str, float]]) -> np.ndarray:
     """Specific force that the chain predicts for the middle sample, body axes."""
     effects = [(effect_named(name), values) for name, values in (("rigid_body", {}), *chain)]
-    return specific_force(act(motion_of_flight(flight), effects))[1]
+    return specific_force(apply_effects(motion_of_flight(flight), effects))[1]
 
 
 def drag_linear(r: np.ndarray, v: np.ndarray, t: float, p: dict) -> np.ndarray:
@@ -178,7 +178,7 @@ def step_response(**chain: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
         thrust_command=np.where(np.arange(n) < 50, 0.4, 0.6),
     )
     effects = [(effect_named("rigid_body"), {}), *((effect_named(k), v) for k, v in chain.items())]
-    return flight.t, specific_force(act(motion_of_flight(flight), effects))[:, 2]
+    return flight.t, specific_force(apply_effects(motion_of_flight(flight), effects))[:, 2]
 
 
 def test_motor_lag_is_a_first_order_response_of_rotor_speed() -> None:
@@ -218,7 +218,7 @@ speeds = st.tuples(*[st.floats(300, 900)] * 4).map(np.array)
 def torque(flight: Flight, *chain: tuple[str, dict[str, float]]) -> np.ndarray:
     """Torque that the chain predicts for the middle sample, body axes; about z over the drag-torque length."""
     motion = motion_of_flight(flight).with_(torque=np.zeros((3, 3)))
-    return act(motion, [(effect_named(n), v) for n, v in chain]).torque[1]
+    return apply_effects(motion, [(effect_named(n), v) for n, v in chain]).torque[1]
 
 
 @settings(max_examples=40, deadline=None)
@@ -289,7 +289,7 @@ def test_rate_loop_lag_is_a_first_order_response_after_a_delay() -> None:
     since = t - t[50] - delay
     expected = np.where(since > 0.0, 1.0 - np.exp(-np.maximum(since, 0.0) / lag), 0.0)
     np.testing.assert_allclose(rate, expected, atol=1e-6)
-    acted = act(
+    acted = apply_effects(
         motion_of_flight(sample(0.0, 0.0, 0.0, (0, 0, 0), 0.4, 1.0, 16.0)),
         [(effect_named("rate_loop_lag"), {"lag": lag, "delay": delay})],
     )
@@ -326,7 +326,7 @@ def test_catalogue_entry_is_complete(effect: Effect) -> None:
         assert p.low < p.high
         assert p.low <= p.neutral_for(VEHICLE) <= p.high
         assert p.structural or p.typical != p.neutral_for(VEHICLE)
-    for other in (*effect.confounded_with, *effect.with_any, *effect.beyond, *effect.seen_as):
+    for other in (*effect.confounded_with, *effect.acts_through, *effect.generalises, *effect.seen_as):
         assert other in catalogue(), f"{effect.name} names the unknown effect {other}"
     if effect.stage in (Stage.COMMAND, Stage.TORQUE, Stage.RATE):
         assert not effect.exports, "a correction is a static map to an acceleration"
@@ -365,7 +365,7 @@ def test_neutral_effect_changes_nothing(effect: Effect) -> None:
     np.testing.assert_allclose(
         torque(flight, (effect.name, effect.neutral(VEHICLE))), torque(flight), atol=1e-9
     )
-    drag = [("rotor_drag", {"x": 0.2, "y": 0.2})] if effect.with_any else []
+    drag = [("rotor_drag", {"x": 0.2, "y": 0.2})] if effect.acts_through else []
     with_it = reading(flight, *drag, (effect.name, effect.neutral(VEHICLE)))
     np.testing.assert_allclose(with_it, reading(flight, *drag), atol=1e-5)
 
@@ -381,7 +381,7 @@ def test_users_effect_is_one_file(tmp_path) -> None:
     )
     assert "tether" in catalogue(str(tmp_path))
     motion = motion_of_flight(sample(0.1, 0.1, 0.0, (0, 0, 0), 0.4, 1.0, 16.0))
-    acted = act(motion, [(effect_named("tether", str(tmp_path)), {"pull": 0.5})])
+    acted = apply_effects(motion, [(effect_named("tether", str(tmp_path)), {"pull": 0.5})])
     assert isinstance(acted, Motion)
     np.testing.assert_allclose(acted.force, 0.5)
 

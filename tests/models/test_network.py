@@ -28,7 +28,7 @@ from trueflight.models.network import (
     network_from_table,
     network_table,
 )
-from trueflight.models.prediction import acceleration, act, error_acceleration, motion_of_flight
+from trueflight.models.prediction import acceleration, apply_effects, error_acceleration, motion_of_flight
 from trueflight.models.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
@@ -116,8 +116,10 @@ def test_wind_changes_what_drag_feels_and_not_what_the_network_sees() -> None:
     base = rigid_body_model(VEHICLE)
     base = base.with_terms((*base.terms, drag, wind))
     motion = motion_of_flight(flight)
-    with_, without = (acceleration(act(motion, m.chain())) for m in (base.with_network(network), base))
-    delivered = act(motion, [])
+    with_, without = (
+        acceleration(apply_effects(motion, m.chain())) for m in (base.with_network(network), base)
+    )
+    delivered = apply_effects(motion, [])
     expected = error_acceleration_of(network, features_of_motion(delivered, network.features))
     np.testing.assert_allclose(with_ - without, expected, atol=1e-9)
 
@@ -126,7 +128,7 @@ def test_thrust_that_the_network_sees_is_the_one_that_acts() -> None:
     flight = a_flight()
     step = np.where(flight.t < 2.0, 0.3, 0.5)
     flight = flight.__class__(**{**flight.__dict__, "thrust_command": step})
-    seen = features_of_motion(act(motion_of_flight(flight), []), ("T",))[:, 0]
+    seen = features_of_motion(apply_effects(motion_of_flight(flight), []), ("T",))[:, 0]
     commanded = VEHICLE.thrust(step)
     after = np.flatnonzero(flight.t >= 2.0)[0]
     assert seen[after] < commanded[after] - 2.0  # neither delay nor lag are over yet
@@ -230,7 +232,7 @@ def test_flight_without_attitude_is_refused_with_what_to_do() -> None:
     blind = flight.__class__(**{**flight.__dict__, "quaternion": None})
     model = linear_model(VEHICLE).with_network(a_network())
     with pytest.raises(InputError, match="quaternion"):
-        act(motion_of_flight(blind), model.chain())
+        apply_effects(motion_of_flight(blind), model.chain())
 
 
 def test_heading_frame_of_the_features_turns_with_yaw() -> None:
