@@ -416,7 +416,7 @@ class Director:
         outcome = self.flight.outcome
         self.emit("info", "mission_ended", f"{mission.trajectory.name}: {outcome}")
         progress.record = self.records.end()
-        # CitedValue last: whoever hears that it is over may fetch the record, which must be whole by then.
+        # Told last: whoever hears that it is over may fetch the record, which must be whole by then.
         progress.reason = outcome
         progress.state = "finished" if outcome == "finished" else "aborted"
         if progress.state == "aborted":

@@ -183,7 +183,7 @@ def without_empty_attitude(columns: dict[str, np.ndarray]) -> dict[str, np.ndarr
 
 
 def without_dead_battery(columns: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """A voltage of zero or less is none: whoever flies has one. CitedValue in a note; all of them: no voltage at all."""
+    """A voltage of zero or less is none: whoever flies has one. Told in a note; all of them: no voltage at all."""
     volts = columns.get("battery_voltage")
     if volts is None or not np.any(dead := volts <= 0.0):
         return columns, []

@@ -229,7 +229,7 @@ def test_the_ground_refuses_the_keys_of_a_vehicle(folder: Path) -> None:
         Link(GroundSettings(keys=str(folder / "vehicle-quad5"), timeout=0.5))
 
 
-# CitedValue
+# Told
 
 
 def test_doctor_and_preflight_say_who_may_fly_it(folder: Path, tmp_path: Path) -> None:
