@@ -25,7 +25,8 @@ from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import load_vehicle
 from trueflight.sim_bridge.in_process import Plan, fly, record
 from trueflight.sim_bridge.simulator import Simulator
-from trueflight.sim_bridge.truth.hidden import EFFECTS, choose
+from trueflight.sim_bridge.truth.effects import EFFECTS
+from trueflight.sim_bridge.truth.hidden import choose
 from trueflight.sim_bridge.world import PHYSICS_STEP, World
 
 QUAD5 = Path(__file__).parents[1] / "models/vehicles/quad5/vehicle.toml"

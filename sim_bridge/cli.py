@@ -587,7 +587,8 @@ def pilot(
 @app.command(epilog="Example: sim-bridge effects --json")
 def effects(as_json: Json = False) -> None:
     """List what can be hidden, with the range of its size when it is drawn, by name or `random`, and by `rich`."""
-    from trueflight.sim_bridge.truth.hidden import EFFECTS, RICH, pool
+    from trueflight.sim_bridge.truth.effects import EFFECTS
+    from trueflight.sim_bridge.truth.hidden import RICH, pool
 
     rows: list[dict[str, Any]] = [
         {

@@ -15,7 +15,8 @@ from trueflight.models.vehicle import Vehicle
 from trueflight.sim_bridge.rates import RateController
 from trueflight.sim_bridge.truth.airframe import believed_powertrain
 from trueflight.sim_bridge.truth.battery import FULL, BatteryState, in_state
-from trueflight.sim_bridge.truth.hidden import Hidden, after_takeoff, install
+from trueflight.sim_bridge.truth.hidden import Hidden
+from trueflight.sim_bridge.truth.installation import after_takeoff, install
 from trueflight.sim_bridge.truth.sensors import Estimate, Noise, Sensors
 from trueflight.sim_bridge.world import PHYSICS_STEP, World
 

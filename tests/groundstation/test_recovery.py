@@ -28,7 +28,8 @@ from trueflight.models.prediction import apply_effects, motion_of_flight, specif
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import GRAVITY, Vehicle, load_vehicle
 from trueflight.sim_bridge.in_process import Plan, record
-from trueflight.sim_bridge.truth.hidden import EFFECTS, Hidden, choose
+from trueflight.sim_bridge.truth.effects import EFFECTS
+from trueflight.sim_bridge.truth.hidden import Hidden, choose
 
 FOLDER = Path(__file__).parents[2] / "models" / "vehicles" / "quad5"
 

@@ -15,7 +15,8 @@ from trueflight.models.vehicle import Vehicle
 from trueflight.sim_bridge.parameters import Parameters
 from trueflight.sim_bridge.seal import reveal, seal
 from trueflight.sim_bridge.settings import load_settings
-from trueflight.sim_bridge.truth.hidden import EFFECTS, RICH, choose, pool
+from trueflight.sim_bridge.truth.effects import EFFECTS
+from trueflight.sim_bridge.truth.hidden import RICH, choose, pool
 
 VEHICLE = ("--vehicle", str(QUAD5 / "vehicle.toml"))
 

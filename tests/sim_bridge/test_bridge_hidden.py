@@ -14,7 +14,9 @@ from trueflight.models.frames import quaternion_from_euler, rotation_matrix
 from trueflight.models.vehicle import GRAVITY, Vehicle
 from trueflight.sim_bridge.simulator import Simulator
 from trueflight.sim_bridge.truth.airframe import Airframe, believed_powertrain
-from trueflight.sim_bridge.truth.hidden import EFFECTS, Hidden, choose, install, pool
+from trueflight.sim_bridge.truth.effects import EFFECTS
+from trueflight.sim_bridge.truth.hidden import Hidden, choose, pool
+from trueflight.sim_bridge.truth.installation import install
 from trueflight.sim_bridge.truth.sensors import NO_NOISE, Sensors
 from trueflight.sim_bridge.world import PHYSICS_STEP
 

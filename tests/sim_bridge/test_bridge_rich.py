@@ -22,7 +22,8 @@ from trueflight.sim_bridge.seal import reveal, seal
 from trueflight.sim_bridge.simulator import Simulator
 from trueflight.sim_bridge.truth.airframe import believed_powertrain
 from trueflight.sim_bridge.truth.battery import Battery, BatteryState, in_state
-from trueflight.sim_bridge.truth.hidden import EFFECTS, RICH, Hidden, choose
+from trueflight.sim_bridge.truth.effects import EFFECTS
+from trueflight.sim_bridge.truth.hidden import RICH, Hidden, choose
 from trueflight.sim_bridge.truth.sensors import NO_NOISE, Sensors
 from trueflight.sim_bridge.world import PHYSICS_STEP
 

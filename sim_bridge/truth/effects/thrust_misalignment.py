@@ -1,0 +1,52 @@
+"""Rotors that lean against the body."""
+
+from __future__ import annotations
+
+import math
+import random
+from math import sqrt
+from typing import ClassVar
+
+from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.truth.airframe import Airframe, Motion
+from trueflight.sim_bridge.truth.effect import TruthEffect
+from trueflight.sim_bridge.truth.sensors import Sensors
+
+
+class ThrustMisalignment(TruthEffect):
+    """Rotors are mounted with a common tilt against the autopilot."""
+
+    name = "thrust_misalignment"
+    what = "every rotor's axis leans by the same angle against the body"
+    low, high, most, drawn, any_draws = 0.02, 0.05, 0.3, False, True
+    units: ClassVar = {"angle": "rad", "x": "rad", "y": "rad"}
+
+    def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
+        """An angle in any direction."""
+        angle, direction = generator.uniform(self.low, self.high), generator.uniform(-math.pi, math.pi)
+        angle = angle if size is None else size
+        return {"angle": angle, "x": angle * math.cos(direction), "y": angle * math.sin(direction)}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """The force of each rotor along its leaning axis, and its torque at the hub."""
+        sx, sy = math.sin(numbers["x"]), math.sin(numbers["y"])
+        short = 1.0 - sqrt(1.0 - sx * sx - sy * sy)
+        hubs = tuple(airframe.vehicle.rotor_positions)
+
+        def act(m: Motion) -> None:
+            body = m.wrench
+            for thrust, (x, y, z) in zip(m.thrusts, hubs, strict=True):
+                fx, fy, fz = sx * thrust, sy * thrust, -short * thrust
+                body[0] += fx
+                body[1] += fy
+                body[2] += fz
+                body[3] += y * fz - z * fy
+                body[4] += z * fx - x * fz
+                body[5] += x * fy - y * fx
+
+        airframe.on_body.append(act)
+
+
+EFFECT = ThrustMisalignment()

@@ -1,0 +1,50 @@
+"""Thrust lost in descent."""
+
+from __future__ import annotations
+
+import math
+from math import sqrt
+from typing import ClassVar
+
+from trueflight.sim_bridge.truth.airframe import AIR_DENSITY, Airframe, Motion
+from trueflight.sim_bridge.truth.effect import TruthEffect
+from trueflight.sim_bridge.truth.sensors import Sensors
+
+
+class VortexRing(TruthEffect):
+    """A rotor that sinks into its own wake loses thrust.
+
+    A raised cosine over the descent speed of each hub, from 0.3 to 1.5 of the hover's induced velocity, as the loss of
+    small propellers measured by Shetty and Selig, AIAA 2011-1254; gone at edgewise speeds above the induced velocity.
+    """
+
+    name = "vortex_ring"
+    what = "each rotor loses thrust where it sinks nearly as fast as its own wake"
+    low, high, most, drawn, any_draws = 0.15, 0.35, 0.8, False, False
+    units: ClassVar = {"loss": "1"}
+
+    def attach(
+        self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
+    ) -> None:
+        """Thrust of rotor i times one minus the loss."""
+        vehicle = airframe.vehicle
+        disc = math.pi * vehicle.rotor_radius**2
+        induced = math.sqrt(0.25 * vehicle.weight / (2.0 * AIR_DENSITY * disc))
+        hubs, loss = tuple(vehicle.rotor_positions), numbers["loss"]
+
+        def act(m: Motion) -> None:
+            u, v, w, p, q = m.u, m.v, m.w, m.p, m.q
+            edgewise = sqrt(u * u + v * v) / induced
+            if edgewise >= 1.0:
+                return
+            thrusts = m.thrusts
+            for i, (x, y, _) in enumerate(hubs):
+                sinking = -(w + p * y - q * x) / induced
+                if 0.3 < sinking < 1.5:
+                    ring = 0.5 - 0.5 * math.cos(2.0 * math.pi * (sinking - 0.3) / 1.2)
+                    thrusts[i] *= 1.0 - loss * ring * (1.0 - edgewise)
+
+        airframe.on_rotors.append(act)
+
+
+EFFECT = VortexRing()
