@@ -12,9 +12,9 @@ import argparse
 import time
 from pathlib import Path
 
-from trueflight.groundstation.commands.train import read_flights
 from trueflight.groundstation.learn.training import recipe_named, train, with_epochs
 from trueflight.groundstation.learn.training_data import samples_of_flights
+from trueflight.groundstation.reading.several import read_flights
 from trueflight.models.model import rigid_body_model
 
 
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--epochs", type=int)
     asked = parser.parse_args()
     for folder in asked.folders:
-        flights = read_flights([folder], None, None, quiet=True)
+        flights = read_flights([folder])
         samples = samples_of_flights(flights, rigid_body_model(flights[0].vehicle))
         print(f"{folder}: {samples.seconds / 60:.1f} min, noise floor {samples.noise_floor:.4f} m/s^2")
         for seed in map(int, asked.seeds.split(",")):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,40 +10,31 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from trueflight.groundstation.commands.options import (
+    DEFAULT_STORE,
+    BandwidthOption,
+    EffectsOption,
+    FlightArgument,
+    JsonOption,
+    MappingOption,
+    ModelOption,
+    ModelsOption,
+    SaveOption,
+    StoreOption,
+    ValidateOption,
+    VehicleOption,
+)
+from trueflight.groundstation.output.terminal import print_json, print_written
 from trueflight.models.errors import InputError
 from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
     from trueflight.groundstation.evaluate.side_by_side import SideBySide
-    from trueflight.models.design import Design
     from trueflight.models.flight import Flight
     from trueflight.models.model import Model
 
 console = Console()
 model_app = typer.Typer(no_args_is_help=True, help="Make, list, show and export model versions.")
-
-FlightArgument = Annotated[
-    Path, typer.Argument(help="A flight: CSV, Parquet, PX4 ULog, MCAP of the companion or ROS 2.")
-]
-VehicleOption = Annotated[
-    Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
-]
-MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML that maps the file's columns.")]
-ModelOption = Annotated[str | None, typer.Option("--model", help="A version number, or a model's JSON file.")]
-StoreOption = Annotated[Path, typer.Option("--store", help="Folder of the model versions.")]
-EffectsOption = Annotated[
-    Path | None, typer.Option("--effects", help="Folder of your own effects, one file each.")
-]
-BandwidthOption = Annotated[
-    float | None, typer.Option("--bandwidth", help="Low-pass for both sides, Hz.", min=0.1)
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
-SaveOption = Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")]
-ModelsOption = Annotated[
-    list[str] | None,
-    typer.Option("--model", help="A version number, or a model's JSON file. Repeat to compare models."),
-]
-DEFAULT_STORE = Path("trueflight-models")
 
 
 def register(app: typer.Typer) -> None:
@@ -55,52 +45,6 @@ def register(app: typer.Typer) -> None:
     app.command("effects")(effects_command)
     app.add_typer(model_app, name="model")
     app.command("demo")(demo_command)
-
-
-def print_json(table: Any) -> None:
-    """One JSON document on standard output."""
-    typer.echo(json.dumps(table, indent=1, allow_nan=False))
-
-
-def _read(path: Path, vehicle: Path | None, mapping: Path | None) -> Flight:
-    from trueflight.groundstation.reading import read_flight
-
-    return read_flight(path, vehicle, mapping)
-
-
-def chosen_model(which: str | None, flight: Flight, store: Path, effects: Path | None) -> Model:
-    """The model asked for; else the newest version of the vehicle; else linear with exact rotation."""
-    from dataclasses import replace
-
-    from trueflight.groundstation.versions.store import find, newest
-    from trueflight.models.model import linear_model, rigid_body_model
-
-    directory = None if effects is None else str(effects)
-    if which == "linear":
-        return linear_model(flight.vehicle)
-    model = (
-        newest(store, flight.vehicle, directory) if which is None else find(store, flight.vehicle.name, which)
-    )
-    if model is None:
-        return rigid_body_model(flight.vehicle, directory)
-    check_vehicle(model, flight)
-    return replace(model, effects_directory=directory or model.effects_directory)
-
-
-def check_vehicle(model: Model, flight: Flight) -> None:
-    """Raise `InputError` where a model was made for another vehicle than the one that flew."""
-    if model.vehicle.name != flight.vehicle.name:
-        raise InputError(
-            f"{model.label} was made for vehicle '{model.vehicle.name}', the flight {flight.name} is of "
-            f"'{flight.vehicle.name}'; pass another --model or --vehicle"
-        )
-    for name in ("mass", "hover_thrust", "thrust_model"):
-        if getattr(model.vehicle, name) != getattr(flight.vehicle, name):
-            raise InputError(
-                f"{model.label} was made for {name} = {getattr(model.vehicle, name)}, "
-                f"{flight.vehicle.source or 'the flight'} "
-                f"says {getattr(flight.vehicle, name)}; make a new model, or pass the vehicle file it was made with"
-            )
 
 
 def compare_command(
@@ -131,16 +75,18 @@ def compare_command(
     from trueflight.groundstation.evaluate.where import where_it_fails
     from trueflight.groundstation.output import as_json as tables_json
     from trueflight.groundstation.output.tables import print_comparisons, print_where
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.several import read_together
+    from trueflight.groundstation.versions.choice import choose_model
+    from trueflight.groundstation.versions.store import lineage
 
     if len(flights) > 1 or len(model or ()) > 1:
-        read = _read_all(flights, vehicle, mapping)
-        models = [
-            [chosen_model(which, flight, store, effects) for which in model or (None,)] for flight in read
-        ]
+        read = read_together(flights, vehicle, mapping)
+        models = [[choose_model(f, which, store, effects) for which in model or (None,)] for f in read]
         _compare_side_by_side(read, models, bandwidth, save, output, as_json)
         return
-    flight = _read(flights[0], vehicle, mapping)
-    line = lineage_of(chosen_model((model or (None,))[0], flight, store, effects), store)
+    flight = read_flight(flights[0], vehicle, mapping)
+    line = lineage(store, choose_model(flight, (model or (None,))[0], store, effects))
     results = [compare(flight, m, bandwidth) for m in line]
     where = where_it_fails(results[-1])
     if save is not None:
@@ -165,26 +111,7 @@ def compare_command(
         return
     print_comparisons(console, results)
     print_where(console, where)
-    print_written(save, output)
-
-
-def _read_all(paths: list[Path], vehicle: Path | None, mapping: Path | None) -> list[Flight]:
-    """The flights, named apart; a flight without a vehicle file of its own has that of the first."""
-    from trueflight.groundstation.evaluate.side_by_side import told_apart
-
-    read = [_read(paths[0], vehicle, mapping)]
-    read += [read_other(path, vehicle, mapping, read[0]) for path in paths[1:]]
-    return told_apart(read)
-
-
-def read_other(path: Path, vehicle: Path | None, mapping: Path | None, first: Flight) -> Flight:
-    """Another flight, with the vehicle file beside it or else that of the first."""
-    try:
-        return _read(path, vehicle, mapping)
-    except InputError:
-        if vehicle is not None or (same := same_vehicle(first)) is None:
-            raise
-        return _read(path, same, mapping)
+    print_written(console, save, output)
 
 
 def _compare_side_by_side(
@@ -216,7 +143,7 @@ def _compare_side_by_side(
         )
         return
     print_side_by_side(console, beside)
-    print_written(save, output)
+    print_written(console, save, output)
 
 
 def _write_side_by_side_report(path: Path, beside: SideBySide) -> dict[str, Any]:
@@ -231,21 +158,6 @@ def _write_side_by_side_report(path: Path, beside: SideBySide) -> dict[str, Any]
     table = {"side_by_side": side_by_side_table(beside), "provenance": asdict(made)}
     write_report(path, render_side_by_side(beside, table))
     return table
-
-
-def print_written(save: Path | None, output: Path | None) -> None:
-    """Say what was written, and where."""
-    if save is not None:
-        console.print(f"Rerun recording: {save}")
-    if output is not None:
-        console.print(f"report: {output}")
-
-
-def lineage_of(model: Model, store: Path) -> list[Model]:
-    """The models from the linear one to `model`."""
-    from trueflight.groundstation.versions.store import lineage
-
-    return lineage(store, model)
 
 
 def where_command(
@@ -267,9 +179,11 @@ def where_command(
     from trueflight.groundstation.evaluate.where import where_it_fails
     from trueflight.groundstation.output import as_json as tables_json
     from trueflight.groundstation.output.tables import print_where
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.versions.choice import choose_model
 
-    read = _read(flight, vehicle, mapping)
-    result = compare(read, chosen_model(model, read, store, effects), bandwidth, horizons=False)
+    read = read_flight(flight, vehicle, mapping)
+    result = compare(read, choose_model(read, model, store, effects), bandwidth, horizons=False)
     where = where_it_fails(result)
     if save is not None:
         from trueflight.groundstation.views import write_where
@@ -279,15 +193,13 @@ def where_command(
         print_json({"model": result.label, "rms": result.rms, **tables_json.where_table(where)})
         return
     print_where(console, where)
-    print_written(save, None)
+    print_written(console, save, None)
 
 
 def diagnose_command(
     flight: FlightArgument,
     vehicle: VehicleOption = None,
-    validate: Annotated[
-        Path | None, typer.Option("--validate", help="Another flight, held out of every fit.")
-    ] = None,
+    validate: ValidateOption = None,
     mapping: MappingOption = None,
     model: ModelOption = None,
     store: StoreOption = DEFAULT_STORE,
@@ -315,9 +227,12 @@ def diagnose_command(
     from trueflight.groundstation.identify.translation import diagnose
     from trueflight.groundstation.output.as_json import analysis_table, diagnosis_table
     from trueflight.groundstation.output.tables import print_diagnosis
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.several import read_held_out
+    from trueflight.groundstation.versions.choice import choose_design, choose_line
 
-    read = _read(flight, vehicle, mapping)
-    held_out = None if validate is None else _read(validate, vehicle or same_vehicle(read), mapping)
+    read = read_flight(flight, vehicle, mapping)
+    held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
     if thrust not in ("command", "rotors"):
         raise InputError(f"--thrust {thrust}: choose command or rotors")
     if thrust == "rotors":
@@ -325,7 +240,7 @@ def diagnose_command(
 
         read = thrust_from_rotors(read)
         held_out = None if held_out is None else thrust_from_rotors(held_out)
-    line = starting_line(model, read, store, effects)
+    line = choose_line(read, model, store, effects)
     with nullcontext() if as_json else console.status("looking for missing effects") as status:
         progress = (lambda text: None) if status is None else status.update
         if save is None:
@@ -335,48 +250,14 @@ def diagnose_command(
             from trueflight.groundstation.evaluate.analysis import analyse
             from trueflight.groundstation.views import write_analysis
 
-            whole = analyse(read, line, held_out, bandwidth, design_of(flight, None, read), progress=progress)
+            whole = analyse(read, line, held_out, bandwidth, choose_design(read), progress=progress)
             result, table = whole.diagnosis, {**analysis_table(whole), "recording": str(save)}
             write_analysis(save, whole)
     if as_json:
         print_json(table)
         return
     print_diagnosis(console, result, everything)
-    print_written(save, None)
-
-
-def starting_line(which: str | None, flight: Flight, store: Path, effects: Path | None) -> list[Model]:
-    """The models that led to the one a diagnosis starts from, that one last; exact rotation is always in it."""
-    from trueflight.models.model import rigid_body_model
-
-    base = chosen_model(which, flight, store, effects)
-    if "rigid_body" not in base.names():
-        if base.network is not None:
-            raise InputError(
-                f"the network of {base.label} was trained beside the linear model, and diagnosis starts from exact "
-                "rotation; pass --model with a version that has rigid_body, or --model linear"
-            )
-        base = rigid_body_model(flight.vehicle, base.effects_directory)
-    return lineage_of(base, store)
-
-
-def design_of(path: Path, design: Path | None, flight: Flight) -> Design | None:
-    """The design that a flight was flown by: the one given, else that of the record; None where there is none."""
-    from trueflight.models.design import load_design
-
-    if design is not None:
-        return load_design(design, flight.vehicle)
-    if path.suffix.lower() == ".mcap":
-        from trueflight.models.record import read_record
-
-        return read_record(path).design
-    return None
-
-
-def same_vehicle(flight: Flight) -> Path | None:
-    """The vehicle file of the first flight also serves the second."""
-    source = Path(flight.vehicle.source)
-    return source if source.is_file() else None
+    print_written(console, save, None)
 
 
 def demo_command(
@@ -490,12 +371,15 @@ def model_add(
     from trueflight.groundstation.evaluate.compare import compare, waterfall
     from trueflight.groundstation.output import as_json as tables_json
     from trueflight.groundstation.output.tables import print_waterfall
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.several import read_held_out
+    from trueflight.groundstation.versions.choice import choose_model
     from trueflight.groundstation.versions.store import add_effect, lineage
     from trueflight.groundstation.versions.store import save as save_version
 
-    read = _read(flight, vehicle, mapping)
-    held_out = None if validate is None else _read(validate, vehicle or same_vehicle(read), mapping)
-    base = chosen_model(model, read, store, effects)
+    read = read_flight(flight, vehicle, mapping)
+    held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
+    base = choose_model(read, model, store, effects)
     with nullcontext() if as_json else console.status(f"fitting {effect}"):
         made = add_effect(base, effect, [read], bandwidth)
     made, path = save_version(store, made, base if base.version else None)
@@ -530,7 +414,7 @@ def model_add(
         low, high = term.intervals[name]
         console.print(f"{effect} {name} = {value:.4g}  [{low:.4g}, {high:.4g}]")
     console.print(f"model version: {path}")
-    print_written(save, None)
+    print_written(console, save, None)
 
 
 @model_app.command("list")
@@ -651,11 +535,13 @@ def model_export(
     Example: groundstation model export v2 --flight identify.csv -o correction.onnx
     """
     from trueflight.groundstation.identify.actuation import actuation_of
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.versions.choice import check_vehicle
     from trueflight.groundstation.versions.store import find
     from trueflight.models.contract import model_hash
     from trueflight.models.export import export_onnx, not_exported
 
-    flights = [_read(path, vehicle, mapping) for path in flight]
+    flights = [read_flight(path, vehicle, mapping) for path in flight]
     model = find(store, flights[0].vehicle.name, which)
     for one in flights:
         check_vehicle(model, one)

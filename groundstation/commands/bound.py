@@ -10,7 +10,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from trueflight.groundstation.commands.analysis import print_json
+from trueflight.groundstation.commands.options import DesignOption, JsonOption, SaveOption, VehicleOption
+from trueflight.groundstation.output.terminal import print_json
 
 if TYPE_CHECKING:
     from trueflight.groundstation.evaluate.bound import Tube
@@ -42,12 +43,8 @@ def bound_command(
         Path | None,
         typer.Option("--from", help="Take the bound on d from this flight: the honest test of a prediction."),
     ] = None,
-    design: Annotated[
-        Path | None, typer.Option("--design", help="Design file; default: that of the record.")
-    ] = None,
-    vehicle: Annotated[
-        Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
-    ] = None,
+    design: DesignOption = None,
+    vehicle: VehicleOption = None,
     around: Annotated[
         AroundWhat,
         typer.Option("--around", help="Middle of the tube: the linear design's flight, or the reference."),
@@ -55,8 +52,8 @@ def bound_command(
     bandwidth: Annotated[
         float, typer.Option("--bandwidth", help="Low-pass on d and eta alike, Hz.", min=1.0)
     ] = 5.0,
-    rrd: Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    rrd: SaveOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """The tube that a flight must stay in, and whether it did: the paper's stability bound in Lyapunov's form.
 

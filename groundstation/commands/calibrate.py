@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from trueflight.groundstation.commands.analysis import JsonOption, print_json
+from trueflight.groundstation.commands.options import QUAD5, JsonOption
+from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 console = Console()
 
-QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
 SHOWN = 30
 """Wrong flights in the table of a terminal; all are in the page and in what `--json` gives."""
 

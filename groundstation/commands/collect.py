@@ -12,10 +12,11 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from trueflight.groundstation.commands.pilot import (
+from trueflight.groundstation.commands.options import (
     CfgOption,
     ConfigOption,
     ConnectOption,
+    ControllerOption,
     JsonOption,
     KeysOption,
     ListenOption,
@@ -23,10 +24,8 @@ from trueflight.groundstation.commands.pilot import (
     NameOption,
     TimeoutOption,
     ZenohOption,
-    check_controller,
-    link_settings,
-    warn,
 )
+from trueflight.groundstation.commands.pilot import check_controller, link_settings, warn
 from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,9 +48,7 @@ def collect_command(
     ],
     seed: Annotated[int, typer.Option(help="Of the flights' order, sizes, speeds and headings.", min=0)] = 0,
     minutes: Annotated[float, typer.Option(help="Flight time to collect, at least.")] = 30.0,
-    controller: Annotated[
-        str, typer.Option(help="lqr, lqr_integral, or corrected by the deployed model.")
-    ] = "lqr",
+    controller: ControllerOption = "lqr",
     patience: Annotated[
         float, typer.Option(help="s to wait on the ground for a companion that refuses.", min=0.0)
     ] = 60.0,

@@ -13,6 +13,14 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from trueflight.groundstation.commands.options import (
+    DesignOption,
+    FlightArgument,
+    JsonOption,
+    MappingOption,
+    SaveOption,
+    VehicleOption,
+)
 from trueflight.models.errors import InputError
 from trueflight.models.outside import toml_table
 
@@ -23,15 +31,6 @@ if TYPE_CHECKING:
     from trueflight.models.flight import Flight
 
 console = Console()
-
-FlightFile = Annotated[
-    Path, typer.Argument(help="A flight: CSV, Parquet, PX4 ULog, MCAP of the companion or ROS 2.")
-]
-VehicleOption = Annotated[
-    Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
-]
-MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML that maps the file's columns.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -167,7 +166,7 @@ def _record_facts(file: Path) -> dict[str, Any]:
 
 
 def import_command(
-    file: FlightFile,
+    file: FlightArgument,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Where to: .csv or .parquet.")] = None,
     vehicle: VehicleOption = None,
     mapping: MappingOption = None,
@@ -405,11 +404,9 @@ def _poles(poles: tuple[complex, ...]) -> str:
 
 def track_command(
     flights: Annotated[list[Path], typer.Argument(help="One flight or more, usually before and after.")],
-    design: Annotated[
-        Path | None, typer.Option("--design", help="Design file; default: that of the record.")
-    ] = None,
+    design: DesignOption = None,
     vehicle: VehicleOption = None,
-    rrd: Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")] = None,
+    rrd: SaveOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Flights against the linear behaviour expected of them: mean squared error per axis, as in the paper."""

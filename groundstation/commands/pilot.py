@@ -13,6 +13,19 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from trueflight.groundstation.commands.options import (
+    CfgOption,
+    ConfigOption,
+    ConnectOption,
+    ControllerOption,
+    JsonOption,
+    KeysOption,
+    ListenOption,
+    ModeOption,
+    NameOption,
+    TimeoutOption,
+    ZenohOption,
+)
 from trueflight.models.contract import CONTROLLERS, too_large
 from trueflight.models.errors import InputError
 
@@ -22,29 +35,6 @@ if TYPE_CHECKING:
     from trueflight.models.record_pb2 import Event
 
 console = Console()
-
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="Settings (groundstation.toml); flags override it.")
-]
-NameOption = Annotated[
-    str | None, typer.Option("--name", help="Vehicle; default: the only one that answers.")
-]
-ConnectOption = Annotated[
-    list[str] | None, typer.Option("-e", "--connect", help="Zenoh endpoint of the companion.")
-]
-ModeOption = Annotated[str | None, typer.Option("-m", "--mode", help="Zenoh mode: peer, client, router.")]
-ListenOption = Annotated[
-    list[str] | None, typer.Option("-l", "--listen", help="Zenoh endpoint to listen on.")
-]
-ZenohOption = Annotated[Path | None, typer.Option("-c", "--zenoh-config", help="Zenoh configuration file.")]
-CfgOption = Annotated[list[str] | None, typer.Option("--cfg", help="Zenoh setting, KEY:VALUE.")]
-TimeoutOption = Annotated[
-    float | None, typer.Option("--timeout", help="Seconds to wait for an answer.", min=0.1)
-]
-KeysOption = Annotated[
-    Path | None, typer.Option("--keys", help="Your folder of `groundstation keys`: TLS, and what you may do.")
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 STYLES = {"warning": "yellow", "error": "red"}
 
@@ -110,9 +100,7 @@ def fly_command(
     trajectory: Annotated[
         str, typer.Argument(help="Name of a trajectory (`groundstation fly list`), or a CSV of setpoints.")
     ],
-    controller: Annotated[
-        str, typer.Option(help="lqr, lqr_integral, or corrected by the deployed model.")
-    ] = "lqr",
+    controller: ControllerOption = "lqr",
     parameters: Annotated[
         list[str] | None, typer.Option("--set", help="Parameter of the trajectory, NAME=VALUE.")
     ] = None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from trueflight.groundstation.commands.analysis import (
+from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
     EffectsOption,
     JsonOption,
@@ -18,8 +18,8 @@ from trueflight.groundstation.commands.analysis import (
     ModelOption,
     StoreOption,
     VehicleOption,
-    print_json,
 )
+from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
 from trueflight.models.whole_file import write_whole
 
@@ -71,11 +71,11 @@ def plan_command(
 
     The file is flown like any table of setpoints: `groundstation fly plan.csv`, `sim-bridge fly --trajectory plan.csv`.
     """
-    from trueflight.groundstation.commands.remainder import base_for_diagnosis
     from trueflight.groundstation.identify.planning import Limits, plan_flight, setpoints
     from trueflight.groundstation.identify.translation import diagnose
     from trueflight.groundstation.output.as_json import plain
     from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.versions.choice import choose_start
     from trueflight.models.vehicle import load_vehicle
 
     limits = Limits(radius, low, high, speed, acceleration, duration)
@@ -90,7 +90,7 @@ def plan_command(
         if flight is not None:
             read = read_flight(flight, vehicle, mapping)
             believed = read.vehicle
-            base = base_for_diagnosis(model, read, store, effects)
+            base = choose_start(read, model, store, effects)
             diagnosis = diagnose(read, base, progress=progress)
         elif vehicle is not None:
             believed = load_vehicle(vehicle)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from trueflight.groundstation.commands.analysis import (
+from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
     BandwidthOption,
     EffectsOption,
@@ -19,15 +19,12 @@ from trueflight.groundstation.commands.analysis import (
     ModelOption,
     StoreOption,
     VehicleOption,
-    chosen_model,
-    print_json,
 )
+from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
     from trueflight.groundstation.results import Diagnosis, Unexplained
-    from trueflight.models.flight import Flight
-    from trueflight.models.model import Model
 
 console = Console()
 
@@ -37,21 +34,6 @@ def register(app: typer.Typer) -> None:
     app.command(
         "remainder", epilog="Example: groundstation remainder flight.mcap --write effects --name side_force"
     )(remainder_command)
-
-
-def base_for_diagnosis(which: str | None, flight: Flight, store: Path, effects: Path | None) -> Model:
-    """The model asked for, as one that a diagnosis can start from: with exact rotation."""
-    from trueflight.models.model import rigid_body_model
-
-    base = chosen_model(which, flight, store, effects)
-    if "rigid_body" in base.names():
-        return base
-    if base.network is not None:
-        raise InputError(
-            f"the network of {base.label} was trained beside the linear model; pass --model with a version that has "
-            "rigid_body, or --model linear"
-        )
-    return rigid_body_model(flight.vehicle, base.effects_directory)
 
 
 def remainder_command(
@@ -76,10 +58,11 @@ def remainder_command(
     from trueflight.groundstation.identify.translation import diagnose
     from trueflight.groundstation.output.as_json import plain
     from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.versions.choice import choose_start
     from trueflight.groundstation.versions.effect_file import write_effect_file
 
     read = read_flight(flight, vehicle, mapping)
-    base = base_for_diagnosis(model, read, store, effects)
+    base = choose_start(read, model, store, effects)
     with nullcontext() if as_json else console.status("explaining what can be explained"):
         result = diagnose(read, base, bandwidth=bandwidth)
     left, path = result.unexplained, None

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
-from trueflight.groundstation.commands.analysis import (
+from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
     BandwidthOption,
     EffectsOption,
@@ -18,16 +19,12 @@ from trueflight.groundstation.commands.analysis import (
     ModelsOption,
     SaveOption,
     StoreOption,
+    ValidateOption,
     VehicleOption,
-    chosen_model,
-    console,
-    design_of,
-    print_json,
-    print_written,
-    read_other,
-    same_vehicle,
-    starting_line,
 )
+from trueflight.groundstation.output.terminal import print_json, print_written
+
+console = Console()
 
 
 def register(app: typer.Typer) -> None:
@@ -43,9 +40,7 @@ def report_command(
     output: Annotated[Path, typer.Option("--output", "-o", help="The HTML file to write.")] = Path(
         "report.html"
     ),
-    validate: Annotated[
-        Path | None, typer.Option("--validate", help="Another flight, held out of every fit.")
-    ] = None,
+    validate: ValidateOption = None,
     beside: Annotated[
         list[Path] | None, typer.Option("--beside", help="Another flight to compare with. Repeatable.")
     ] = None,
@@ -71,24 +66,26 @@ def report_command(
     side_by_side, blind, provenance.
     """
     from trueflight.groundstation.evaluate.analysis import analyse
-    from trueflight.groundstation.evaluate.side_by_side import side_by_side, told_apart
+    from trueflight.groundstation.evaluate.side_by_side import side_by_side
     from trueflight.groundstation.output.as_json import analysis_table
     from trueflight.groundstation.output.tables import print_diagnosis
     from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.several import read_beside, read_held_out, told_apart
     from trueflight.groundstation.report import chosen, render, write_report
+    from trueflight.groundstation.versions.choice import choose_design, choose_line, choose_model
 
     sections = chosen(without or ())
     read = read_flight(flight, vehicle, mapping)
-    held_out = None if validate is None else read_flight(validate, vehicle or same_vehicle(read), mapping)
-    flights = told_apart([read, *(read_other(path, vehicle, mapping, read) for path in beside or ())])
-    named = [[chosen_model(which, f, store, effects) for which in model or (None,)] for f in flights]
-    line = starting_line(model[-1] if model else None, read, store, effects)
+    held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
+    flights = told_apart([read, *(read_beside(path, read, vehicle, mapping) for path in beside or ())])
+    named = [[choose_model(f, which, store, effects) for which in model or (None,)] for f in flights]
+    line = choose_line(read, model[-1] if model else None, store, effects)
     with nullcontext() if as_json else console.status("comparing") as status:
         progress = (lambda text: None) if status is None else status.update
         several = len(flights) > 1 or len(named[0]) > 1
         together = side_by_side(flights, named, bandwidth) if several else None
         whole = analyse(
-            read, line, held_out, bandwidth, design_of(flight, design, read), together, progress=progress
+            read, line, held_out, bandwidth, choose_design(read, design), together, progress=progress
         )
         progress("drawing")
         table = analysis_table(whole)
@@ -101,4 +98,4 @@ def report_command(
         print_json({**table, "report": str(output), "recording": None if save is None else str(save)})
         return
     print_diagnosis(console, whole.diagnosis)
-    print_written(save, output)
+    print_written(console, save, output)

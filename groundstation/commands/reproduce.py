@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from trueflight.groundstation.commands.analysis import print_json
+from trueflight.groundstation.commands.options import QUAD5, JsonOption
+from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
 from trueflight.models.outside import read_text
 from trueflight.models.whole_file import write_whole
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from trueflight.groundstation.study.reproduce import Prepared, Scenario, Study
 
 console = Console()
-
-QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
 
 
 def register(app: typer.Typer) -> None:
@@ -63,7 +62,7 @@ def reproduce_command(
         Path | None,
         typer.Option("--save", "--rrd", help="Write a Rerun recording of the unseen scenario here."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Collect, diagnose, train and fly every controller on flights no model has seen; print the paper's Table I.
 

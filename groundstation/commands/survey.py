@@ -13,13 +13,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from trueflight.groundstation.commands.analysis import (
-    EffectsOption,
-    JsonOption,
-    MappingOption,
-    VehicleOption,
-    print_json,
-)
+from trueflight.groundstation.commands.options import EffectsOption, JsonOption, MappingOption, VehicleOption
+from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
 from trueflight.models.whole_file import write_whole
 
@@ -61,10 +56,10 @@ def survey_command(
     A file that cannot be used is told and skipped. `--save` writes survey.jsonl (one line a flight, as they are done),
     survey.parquet and fleet.json.
     """
-    from trueflight.groundstation.evaluate.survey import fleet_of, flight_files, row_table, stamp_of, survey
+    from trueflight.groundstation.evaluate.survey import fleet_of, row_table, stamp_of, survey, survey_files
     from trueflight.groundstation.output.as_json import plain
 
-    files = flight_files(folder)
+    files = survey_files(folder)
     known = [] if save is None else _already(save, files)
     done = {(row.file, row.stamp) for row in known}
     left = [f for f in files if (str(f.resolve()), stamp_of(f)) not in done]

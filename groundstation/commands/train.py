@@ -11,19 +11,18 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from trueflight.groundstation.commands.analysis import (
+from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
     BandwidthOption,
     EffectsOption,
     JsonOption,
     MappingOption,
     ModelOption,
+    SaveOption,
     StoreOption,
     VehicleOption,
-    check_vehicle,
-    chosen_model,
-    print_json,
 )
+from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,7 +44,6 @@ SeedOption = Annotated[
 EpochsOption = Annotated[
     int | None, typer.Option("--epochs", help="At most so many; default: the recipe's.", min=1, max=100000)
 ]
-SaveOption = Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -86,7 +84,7 @@ def train_command(
     from trueflight.groundstation.versions.store import save as save_version
 
     widths, chosen = _widths(layers), with_epochs(recipe_named(recipe), epochs)
-    flights = read_flights(flight, vehicle, mapping, quiet=as_json)
+    flights = _read_flights(flight, vehicle, mapping, as_json)
     base = _base(model, flights, store, effects)
     samples = _samples(flights, base, bandwidth, as_json)
     checkpoint = store / base.vehicle.name / "training.checkpoint"
@@ -165,7 +163,7 @@ def ablate_command(
 
     tried = architectures(_numbers("--depths", depths, 7), _numbers("--widths", widths, 1024))
     chosen = with_epochs(recipe_named(recipe), epochs)
-    flights = read_flights(flight, vehicle, mapping, quiet=as_json)
+    flights = _read_flights(flight, vehicle, mapping, as_json)
     base = _base(model, flights, store, effects)
     samples = _samples(flights, base, bandwidth, as_json)
     jobs = len(tried) + (len(samples.varying) + LEAST_IMPORTANT if features else 0)
@@ -196,45 +194,24 @@ def ablate_command(
 # --- what goes in ---------------------------------------------------------------------------------------------------
 
 
-def read_flights(
-    paths: list[Path], vehicle: Path | None, mapping: Path | None, quiet: bool = False
-) -> list[Flight]:
-    """The flights of files and folders, folders by name; of a record and its table, the record.
+def _read_flights(paths: list[Path], vehicle: Path | None, mapping: Path | None, quiet: bool) -> list[Flight]:
+    from trueflight.groundstation.reading.several import flights_in, read_flights
 
-    Raises `InputError` for a folder without flights, and for whatever makes a file unfit.
-    """
-    from trueflight.groundstation.reading import read_flight
-
-    files = [file for path in paths for file in (_flights_in(path) if path.is_dir() else [path])]
-    flights = []
+    files = flights_in(paths)
     with nullcontext() if quiet or len(files) < 4 else _bar("reading flights", len(files)) as show:
-        for number, file in enumerate(files, 1):
-            flights.append(read_flight(file, vehicle, mapping))
+
+        def tell(done: int, file: Path) -> None:
             if show is not None:
-                show(number, file.name)
-    return flights
+                show(done, file.name)
 
-
-def _flights_in(folder: Path) -> list[Path]:
-    from trueflight.groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
-    from trueflight.models.whole_file import is_hidden
-
-    endings = (*RECORDS, *TABLES, *ULOGS)
-    found: dict[Path, Path] = {}
-    for file in sorted(folder.rglob("*")):
-        if file.suffix.lower() not in endings or not file.is_file() or is_hidden(file, folder):
-            continue
-        known = found.get(file.with_suffix(""))
-        if known is None or endings.index(file.suffix.lower()) < endings.index(known.suffix.lower()):
-            found[file.with_suffix("")] = file
-    if not found:
-        raise InputError(f"{folder}: no flights in this folder (known endings: {', '.join(endings)})")
-    return list(found.values())
+        return read_flights(files, vehicle, mapping, tell)
 
 
 def _base(which: str | None, flights: list[Flight], store: Path, effects: Path | None) -> Model:
     """The model whose remainder is learnt, checked against the vehicle of every flight."""
-    model = chosen_model(which, flights[0], store, effects)
+    from trueflight.groundstation.versions.choice import check_vehicle, choose_model
+
+    model = choose_model(flights[0], which, store, effects)
     for flight in flights:
         check_vehicle(model, flight)
     return model

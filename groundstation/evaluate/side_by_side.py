@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 from trueflight.groundstation.evaluate.compare import compare
 from trueflight.groundstation.evaluate.where import common_bins, where_it_fails
@@ -59,12 +58,3 @@ def _names(comparisons: Sequence[Comparison], flights: bool, models: bool) -> tu
         f"{name} ({names[: k + 1].count(name)})" if names.count(name) > 1 else name
         for k, name in enumerate(names)
     )
-
-
-def told_apart(flights: Sequence[Flight]) -> list[Flight]:
-    """The flights, named by their folder too where two files have the same name."""
-    names = [f.name for f in flights]
-    return [
-        replace(f, name=f"{Path(f.origin).parent.name}/{f.name}") if names.count(f.name) > 1 else f
-        for f in flights
-    ]

@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from trueflight.groundstation.reading.flight_file import ENDINGS
+from trueflight.groundstation.reading.several import flight_files
 from trueflight.models.errors import InputError
 from trueflight.models.outside import is_number
-from trueflight.models.whole_file import is_hidden, whole_file
+from trueflight.models.whole_file import whole_file
 
 VERDICTS = ("missing", "possible", "not_supported", "not_excited", "included")
 
@@ -106,20 +108,11 @@ class Fleet:
     parameters: tuple[Spread, ...]
 
 
-def flight_files(folder: Path) -> list[Path]:
-    """Every flight file below `folder`; raises `InputError` where there is none."""
-    from trueflight.groundstation.reading.flight_file import RECORDS, TABLES, ULOGS
-
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; pass the one that holds your flights")
-    endings = (*TABLES, *RECORDS, *ULOGS)
-    files = sorted(
-        f
-        for f in folder.rglob("*")
-        if f.suffix.lower() in endings and f.is_file() and not is_hidden(f, folder) and f.name != SAVED_TABLE
-    )
+def survey_files(folder: Path) -> list[Path]:
+    """Every flight file below `folder`, but not what a survey left there; raises `InputError` where there is none."""
+    files = [file for file in flight_files(folder) if file.name != SAVED_TABLE]
     if not files:
-        raise InputError(f"{folder}: no flights in it; known endings are {', '.join(endings)}")
+        raise InputError(f"{folder}: no flights in it; known endings are {', '.join(ENDINGS)}")
     return files
 
 

@@ -20,6 +20,7 @@ from trueflight.models.vehicle import Vehicle, load_vehicle
 TABLES = (".csv", ".txt", ".tsv", ".parquet", ".pq")
 RECORDS = (".mcap",)
 ULOGS = (".ulg", ".ulog")
+ENDINGS = (*TABLES, *RECORDS, *ULOGS)
 
 
 def read_flight(
@@ -56,8 +57,7 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: str 
 
         return read_ulog(path, _vehicle(path, vehicle))
     if suffix not in TABLES:
-        known = ", ".join((*TABLES, *RECORDS, *ULOGS))
-        raise InputError(f"{path}: '{suffix}' is no kind of flight file; known are {known}")
+        raise InputError(f"{path}: '{suffix}' is no kind of flight file; known are {', '.join(ENDINGS)}")
     table = read_table(path)
     believed = _vehicle(path, vehicle)
     mapping = mapping or _mapping_beside(path, table)

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from trueflight.groundstation.evaluate.analysis import analyse
-from trueflight.groundstation.evaluate.side_by_side import side_by_side, told_apart
+from trueflight.groundstation.evaluate.side_by_side import side_by_side
 from trueflight.groundstation.output.as_json import analysis_table
 from trueflight.groundstation.output.cited import CitedValue, environment, sentences, written
 from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.reading.several import told_apart
 from trueflight.groundstation.report import SECTIONS, chosen, render, write_report
 from trueflight.groundstation.views import write_analysis
 from trueflight.models.errors import InputError

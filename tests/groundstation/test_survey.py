@@ -14,8 +14,8 @@ from trueflight.groundstation.evaluate.survey import (
     Estimate,
     Row,
     fleet_of,
-    flight_files,
     survey,
+    survey_files,
     survey_flight,
 )
 from trueflight.models.design import load_design
@@ -99,7 +99,7 @@ def test_every_flight_is_a_row_and_a_bad_file_is_skipped(folder, tmp_path, capsy
 
 def test_a_worker_that_dies_costs_its_file_only(folder, tmp_path, monkeypatch) -> None:
     pytest.importorskip("distributed")
-    files = flight_files(folder)[:4]
+    files = survey_files(folder)[:4]
     monkeypatch.setattr("trueflight.groundstation.evaluate.survey.survey_flight", _dies_on_the_second)
     rows = list(survey(files, jobs=2))
     assert len(rows) == 4
@@ -116,7 +116,7 @@ def test_no_scheduler_and_no_flights_are_told_in_one_line(folder, tmp_path, caps
     code, _, err = run(capsys, monkeypatch, "survey", tmp_path)
     assert (code, err.count("\n")) == (2, 1)
     with pytest.raises(InputError, match="no such folder"):
-        flight_files(tmp_path / "nowhere")
+        survey_files(tmp_path / "nowhere")
 
 
 def rows_of(values: dict[str, list[float]], half: float) -> list[Row]:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trueflight.groundstation.commands.train import read_flights
 from trueflight.groundstation.evaluate.compare import compare, waterfall
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.learn.ablation import ablate, inference_time
@@ -23,6 +22,7 @@ from trueflight.groundstation.learn.training import (
 )
 from trueflight.groundstation.learn.training_data import GAP, blocks, samples_of_flights, split
 from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.reading.several import read_flights
 from trueflight.groundstation.versions.store import add_effect, find, lineage, save
 from trueflight.models.errors import InputError
 from trueflight.models.export import export_onnx
@@ -57,7 +57,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def flights(folder):
-    return read_flights([folder / "learn"], None, None, quiet=True)
+    return read_flights([folder / "learn"])
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,70 @@
+"""The arguments and options that several commands share, each declared once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
+"""The vehicle that stands where none is named: the 5-inch quadrotor."""
+
+# --- flights, and what they are held against ------------------------------------------------------------------------
+
+FlightArgument = Annotated[
+    Path, typer.Argument(help="A flight: CSV, Parquet, PX4 ULog, MCAP of the companion or ROS 2.")
+]
+VehicleOption = Annotated[
+    Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
+]
+MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML that maps the file's columns.")]
+ValidateOption = Annotated[
+    Path | None, typer.Option("--validate", help="Another flight, held out of every fit.")
+]
+ModelOption = Annotated[str | None, typer.Option("--model", help="A version number, or a model's JSON file.")]
+ModelsOption = Annotated[
+    list[str] | None,
+    typer.Option("--model", help="A version number, or a model's JSON file. Repeat to compare models."),
+]
+StoreOption = Annotated[Path, typer.Option("--store", help="Folder of the model versions.")]
+DEFAULT_STORE = Path("trueflight-models")
+EffectsOption = Annotated[
+    Path | None, typer.Option("--effects", help="Folder of your own effects, one file each.")
+]
+BandwidthOption = Annotated[
+    float | None, typer.Option("--bandwidth", help="Low-pass for both sides, Hz.", min=0.1)
+]
+DesignOption = Annotated[
+    Path | None, typer.Option("--design", help="Design file; default: that of the record.")
+]
+
+# --- what comes out -------------------------------------------------------------------------------------------------
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+SaveOption = Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")]
+
+# --- the way to a companion -----------------------------------------------------------------------------------------
+
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="Settings (groundstation.toml); flags override it.")
+]
+NameOption = Annotated[
+    str | None, typer.Option("--name", help="Vehicle; default: the only one that answers.")
+]
+ConnectOption = Annotated[
+    list[str] | None, typer.Option("-e", "--connect", help="Zenoh endpoint of the companion.")
+]
+ModeOption = Annotated[str | None, typer.Option("-m", "--mode", help="Zenoh mode: peer, client, router.")]
+ListenOption = Annotated[
+    list[str] | None, typer.Option("-l", "--listen", help="Zenoh endpoint to listen on.")
+]
+ZenohOption = Annotated[Path | None, typer.Option("-c", "--zenoh-config", help="Zenoh configuration file.")]
+CfgOption = Annotated[list[str] | None, typer.Option("--cfg", help="Zenoh setting, KEY:VALUE.")]
+TimeoutOption = Annotated[
+    float | None, typer.Option("--timeout", help="Seconds to wait for an answer.", min=0.1)
+]
+KeysOption = Annotated[
+    Path | None, typer.Option("--keys", help="Your folder of `groundstation keys`: TLS, and what you may do.")
+]
+ControllerOption = Annotated[str, typer.Option(help="lqr, lqr_integral, or corrected by the deployed model.")]
