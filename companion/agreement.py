@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from trueflight.companion.vehicle_link import ImuSample, Odometry
+from trueflight.companion.odometry import ImuSample, Odometry
 from trueflight.models.vehicle import GRAVITY
 
 Vector = tuple[float, float, float]

@@ -13,13 +13,14 @@ from trueflight.companion.director import Director
 from trueflight.companion.flight import IDLE, FlightStateMachine
 from trueflight.companion.law.control import ControlLaw
 from trueflight.companion.mission_request import SMALL, read_json, read_request
+from trueflight.companion.odometry import Odometry
 from trueflight.companion.pose import PoseFeed
 from trueflight.companion.settings import Settings
 from trueflight.companion.signature import Signatures
 from trueflight.companion.store import ModelStore
 from trueflight.companion.telemetry import ATTACHED, Telemetry, make_event
 from trueflight.companion.tick import make_tick
-from trueflight.companion.vehicle_link import Odometry, VehicleLink
+from trueflight.companion.vehicle_link import VehicleLink
 from trueflight.companion.watchdog import Watchdog, raise_priority
 from trueflight.companion.zenoh_session import INSECURE, open_planned, plan_session
 from trueflight.models.contract import model_hash

@@ -29,13 +29,13 @@ from trueflight.companion.flight import (
 )
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import GuardLimits
-from trueflight.companion.message_rates import link_too_slow, odometry_too_low
+from trueflight.companion.message_rates import Rates, link_too_slow, odometry_too_low
 from trueflight.companion.mission_request import mission_request
 from trueflight.companion.pose import PoseFeed
 from trueflight.companion.records import Records
 from trueflight.companion.shadow import Shadow, ShadowLimits
 from trueflight.companion.store import ModelStore
-from trueflight.companion.vehicle_link import Rates, VehicleLink
+from trueflight.companion.vehicle_link import VehicleLink
 from trueflight.models.contract import CORRECTED
 from trueflight.models.design import Design
 from trueflight.models.errors import InputError, shown

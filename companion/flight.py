@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from trueflight.companion.agreement import Agreement, AgreementLimits
+from trueflight.companion.latest import Latest
 from trueflight.companion.law.control import (
     IDLE_STEP,
     Attitude,
@@ -30,9 +31,9 @@ from trueflight.companion.law.control import (
 from trueflight.companion.law.controllers import Controller, TrimLimits, make_controller
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import Watch
+from trueflight.companion.odometry import Odometry
 from trueflight.companion.resets import Reset, found_reset
 from trueflight.companion.shadow import Shadow, error_acceleration
-from trueflight.companion.vehicle_link import Latest, Odometry
 from trueflight.models.contract import CONTROLLERS, CORRECTED
 from trueflight.models.errors import InputError
 from trueflight.models.reference import Trajectory, transfer

@@ -1,12 +1,30 @@
-"""What to set in PX4 where its messages come too rarely."""
+"""How often the autopilot's messages come, and what to set in PX4 where that is too rarely."""
 
 from __future__ import annotations
 
-from trueflight.companion.vehicle_link import Rates
+import math
+from dataclasses import dataclass
 
 _ONBOARD_RATE = (
     80_000  # bytes/s: odometry and accelerometer for 100 Hz of control beside an onboard link's other streams
 )
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What arrives: messages a second of the vehicle's clock (odometry), and of ours (the others).
+
+    `mode` counts both messages that tell the flight mode. `longest_gap` in s of the vehicle's clock between two
+    odometry messages, `duration` of the measurement in s.
+    """
+
+    odometry: float
+    imu: float
+    battery: float
+    esc: float
+    longest_gap: float
+    duration: float
+    mode: float = math.inf
 
 
 def odometry_too_low(rates: Rates, wanted: float, share: float = 0.75) -> str:

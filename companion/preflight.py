@@ -17,11 +17,11 @@ import numpy as np
 
 from trueflight.companion.access import access_findings
 from trueflight.companion.findings import FAIL, NOTE, OK, WARN, Finding, rows_of
-from trueflight.companion.message_rates import link_too_slow, odometry_too_low
+from trueflight.companion.message_rates import Rates, link_too_slow, odometry_too_low
 from trueflight.companion.pose import PoseFeed
 from trueflight.companion.px4_events import ERROR
 from trueflight.companion.settings import Settings
-from trueflight.companion.vehicle_link import Rates, VehicleLink
+from trueflight.companion.vehicle_link import VehicleLink
 from trueflight.models.errors import InputError
 from trueflight.models.record import read_record
 from trueflight.models.vehicle import Vehicle

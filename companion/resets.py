@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from trueflight.companion.vehicle_link import Odometry
+from trueflight.companion.odometry import Odometry
 
 Vector = tuple[float, float, float]
 

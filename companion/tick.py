@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from trueflight.companion.flight import Outcome
-from trueflight.companion.vehicle_link import Latest, Odometry
+from trueflight.companion.latest import Latest
+from trueflight.companion.odometry import Odometry
 from trueflight.models.record_pb2 import Tick
 
 

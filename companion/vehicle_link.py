@@ -6,8 +6,8 @@ offboard plugin sends the last setpoint again at 20 Hz for ever; here a setpoint
 law made one, so that a companion that hangs, is stopped or is killed falls silent and the autopilot's
 offboard-loss failsafe takes over.
 
-MAVLink speaks NED and FRD; this module turns them into ENU and FLU, and nothing else in the companion knows
-of them. Callbacks run on MAVSDK's thread; it is the control thread.
+What MAVLink says in NED and FRD is turned into ENU and FLU by `companion.odometry`. Callbacks run on MAVSDK's thread;
+it is the control thread.
 """
 
 from __future__ import annotations
@@ -18,12 +18,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import mavsdk
-import numpy as np
 from mavsdk.mavsdk import Configuration, Mavsdk
 from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
 from mavsdk.plugins.mocap.mocap import (
@@ -38,17 +36,20 @@ from mavsdk.plugins.param.param import Param, ParamError, ParamResult
 from mavsdk.system import System
 
 from trueflight.companion.arrival import Arrivals
-from trueflight.companion.estimator import EstimatorStatus, estimator_status
+from trueflight.companion.estimator import estimator_status
+from trueflight.companion.latest import Latest, mode_name
+from trueflight.companion.message_rates import Rates
+from trueflight.companion.odometry import (
+    Odometry,
+    Vector,
+    odometry_from_wire,
+    setpoint_on_wire,
+    vision_estimate,
+    without_covariance,
+)
 from trueflight.companion.px4_events import ArmingChecks, ArmingReport, Px4Event, describe, unhealthy
-from trueflight.models import frames
 from trueflight.models.errors import InputError
 from trueflight.models.pose import Pose
-
-Vector = tuple[float, float, float]
-
-_ROOT_HALF = math.sqrt(0.5)
-_FRAMES_WORLD_NED = (1,)  # MAV_FRAME_LOCAL_NED: what PX4 says of its odometry's velocity
-_FRAMES_BODY_FRD = (8, 12)  # MAV_FRAME_BODY_NED (deprecated name) and MAV_FRAME_BODY_FRD
 
 _COUNTED = ("ODOMETRY", "HIGHRES_IMU", "BATTERY_STATUS", "ESC_STATUS", "MODE")
 _MESSAGE_IDS = {
@@ -79,129 +80,14 @@ _CRITICAL, _TERMINATED = 5, 8  # MAV_STATE of a failsafe that acts, and of motor
 _GROUND_STATION_HEARTBEAT = (
     '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
 )
-_MODES = {
-    (1, 0): "MANUAL",
-    (2, 0): "ALTCTL",
-    (3, 0): "POSCTL",
-    (4, 1): "READY",
-    (4, 2): "TAKEOFF",
-    (4, 3): "HOLD",
-    (4, 4): "MISSION",
-    (4, 5): "RETURN_TO_LAUNCH",
-    (4, 6): "LAND",
-    (4, 8): "FOLLOW_ME",
-    (5, 0): "ACRO",
-    (6, 0): "OFFBOARD",
-    (7, 0): "STABILIZED",
-    (8, 0): "RATTITUDE",
-    (10, 0): "TERMINATION",
-}
 _MODE_NUMBERS = {"OFFBOARD": (6, 0), "LAND": (4, 6), "HOLD": (4, 3)}
 _LANDED = {0: "unknown", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
-_RECENT = 2.0  # s
 _MODE_RATE = (
     50.0  # Hz: PX4 looks so often for a change of mode, and then tells it (CURRENT_MODE, from 1.15 on)
 )
 _TIMESYNC_RATE = 50.0  # Hz; PX4 wants 500 answers
 _RPM = 2.0 * math.pi / 60.0
 _AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
-
-
-class Odometry(NamedTuple):
-    """One odometry message, ENU and FLU, SI; `vehicle_time_us` is the vehicle's clock, `host_time_ns` ours.
-
-    `age` s passed by the vehicle's clock from the stamp to `host_time_ns`; `overtaken` samples before this one were not
-    looked at, because newer ones were waiting.
-    """
-
-    vehicle_time_us: int
-    host_time_ns: int
-    position: Vector
-    velocity: Vector
-    quaternion: tuple[float, float, float, float]
-    angular_velocity: Vector
-    reset_counter: int
-    age: float = 0.0
-    overtaken: int = 0
-
-
-class ImuSample(NamedTuple):
-    """One HIGHRES_IMU message: the vehicle's clock in us, m/s² and rad/s in FLU."""
-
-    time_us: int
-    specific_force: Vector
-    gyro: Vector
-
-
-@dataclass
-class Latest:
-    """The last of everything that arrives beside the odometry; written by MAVSDK's thread, read by any.
-
-    `battery_voltage` V (0 unknown) is that of the battery with the lowest number, `batteries` has all of them.
-    `rotor_speed` rad/s (empty unknown). `imu` is HIGHRES_IMU as it came, not yet read: it arrives just before the
-    odometry, and what it takes to read it would delay the setpoint. `mode_time_us` is when mode and arming were told
-    last, by the vehicle's clock: the stamp of the odometry that came before it, however late either was read.
-    `killed` while the motors are cut (kill switch, termination), `failsafe` where the mode is one that the
-    autopilot's failsafe chose, `unhealthy` what SYS_STATUS says is not well, `notices` what it told of failsafes,
-    switches and failed checks (monotonic s, text). `estimator` is what the estimator says of itself, None before it
-    said anything. PX4 sends odometry whether or not that is a position.
-    """
-
-    battery_voltage: float = 0.0
-    batteries: dict[int, float] = field(default_factory=dict)
-    rotor_speed: tuple[float, ...] = ()
-    flight_mode: str = "UNKNOWN"
-    mode_time_us: int | None = None
-    armed: bool = False
-    landed: str = "unknown"
-    heartbeat: float = -math.inf
-    texts: deque[str] = field(default_factory=lambda: deque(maxlen=20))
-    imu: str = ""
-    killed: bool = False
-    failsafe: bool = False
-    unhealthy: tuple[str, ...] = ()
-    estimator: EstimatorStatus | None = None
-    notices: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=4))
-    _read: tuple[str, ImuSample | None] = ("", None)
-
-    @property
-    def why(self) -> str:
-        """What the autopilot told in the last seconds, in plain words; '' where nothing."""
-        now = time.monotonic()
-        return "; ".join(text for told, text in tuple(self.notices) if now - told < _RECENT)
-
-    @property
-    def imu_sample(self) -> ImuSample | None:
-        """What HIGHRES_IMU said last; None before the first message and for one with a number missing. Read once."""
-        text, sample = self._read
-        if text is not self.imu:
-            text = self.imu
-            sample = imu_from_wire(text)
-            self._read = text, sample
-        return sample
-
-    @property
-    def specific_force(self) -> Vector | None:
-        """Specific force of the accelerometer, m/s² FLU; None where `imu_sample` is None."""
-        sample = self.imu_sample
-        return sample.specific_force if sample is not None else None
-
-
-@dataclass(frozen=True)
-class Rates:
-    """What arrives: messages a second of the vehicle's clock (odometry), and of ours (the others).
-
-    `mode` counts both messages that tell the flight mode. `longest_gap` in s of the vehicle's clock between two
-    odometry messages, `duration` of the measurement in s.
-    """
-
-    odometry: float
-    imu: float
-    battery: float
-    esc: float
-    longest_gap: float
-    duration: float
-    mode: float = math.inf
 
 
 class VehicleLink:
@@ -319,15 +205,12 @@ class VehicleLink:
 
         Raises `MavlinkDirectError` where MAVSDK refuses it.
         """
-        p, q, r = body_rate
         self._direct.send_message(
             MavlinkMessage(
                 "SET_ATTITUDE_TARGET",
                 target_system_id=self._system,
                 target_component_id=_AUTOPILOT,
-                fields_json=f'{{"time_boot_ms":{time_us // 1000 & 0xFFFFFFFF},"target_system":{self._system},'
-                f'"target_component":1,"type_mask":128,"body_roll_rate":{p:.7g},'
-                f'"body_pitch_rate":{-q:.7g},"body_yaw_rate":{-r:.7g},"thrust":{thrust:.7g}}}',
+                fields_json=setpoint_on_wire(self._system, time_us, thrust, body_rate),
             )
         )
 
@@ -346,8 +229,13 @@ class VehicleLink:
         PX4's estimator takes this message and ODOMETRY alone, and MAVSDK's ODOMETRY names a frame that PX4 no
         longer reads. Raises `RuntimeError` where MAVSDK refuses it.
         """
+        told = vision_estimate(pose, taken_us, reset_counter)
+        position, angles = PositionBody(*told.position), AngleBody(*told.angles)
+        covariance = Covariance(told.covariance)
         try:
-            self._mocap.set_vision_position_estimate(vision_estimate(pose, taken_us, reset_counter))
+            self._mocap.set_vision_position_estimate(
+                VisionPositionEstimate(told.taken_us, position, angles, covariance, told.reset_counter)
+            )
         except MocapError as error:
             raise RuntimeError(error.result.name.lower().replace("_", " ")) from None
 
@@ -633,94 +521,3 @@ class VehicleLink:
     def _system_status(self, fields: dict[str, Any]) -> None:
         enabled = int(fields["onboard_control_sensors_enabled"])
         self.latest.unhealthy = unhealthy(enabled, int(fields["onboard_control_sensors_health"]))
-
-
-def vision_estimate(pose: Pose, taken_us: int, reset_counter: int) -> VisionPositionEstimate:
-    """A pose in ENU and FLU as the autopilot wants it: NED, and roll, pitch, yaw of FRD."""
-    north, east, down = (float(x) for x in frames.enu_from_ned(np.array(pose.position)))
-    attitude = frames.enu_flu_from_ned_frd(np.array(pose.quaternion))
-    roll, pitch, yaw = (float(x) for x in frames.euler_from_quaternion(attitude))
-    covariance = [math.nan]
-    if math.isfinite(pose.position_std) and math.isfinite(pose.attitude_std):
-        # The upper right triangle, row by row, of x, y, z, roll, pitch, yaw.
-        covariance = [0.0] * 21
-        for i, std in zip(
-            (0, 6, 11, 15, 18, 20), (pose.position_std,) * 3 + (pose.attitude_std,) * 3, strict=True
-        ):
-            covariance[i] = std * std
-    return VisionPositionEstimate(
-        taken_us,
-        PositionBody(north, east, down),
-        AngleBody(roll, pitch, yaw),
-        Covariance(covariance),
-        reset_counter,
-    )
-
-
-def without_covariance(text: str) -> str:
-    """The JSON of a message without its covariances: 42 numbers that nobody here reads and that take half the
-    time.
-    """
-    for name in ('"pose_covariance":[', '"velocity_covariance":['):
-        begin = text.find(name)
-        if begin >= 0:
-            text = text[:begin] + text[text.index("],", begin) + 2 :]
-    return text
-
-
-def mode_name(custom_mode: int) -> str:
-    """PX4's flight mode of a heartbeat, as MAVSDK names it."""
-    main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
-    return _MODES.get((main, sub), _MODES.get((main, 0), "UNKNOWN"))
-
-
-def imu_from_wire(text: str) -> ImuSample | None:
-    """A HIGHRES_IMU message (JSON as on the wire, FRD) in FLU; None where a number that is needed is not there."""
-    try:
-        fields = json.loads(text)
-        force = fields["xacc"], -fields["yacc"], -fields["zacc"]
-        gyro = fields["xgyro"], -fields["ygyro"], -fields["zgyro"]
-        if not math.isfinite(sum(force) + sum(gyro)):
-            return None
-        return ImuSample(int(fields["time_usec"]), force, gyro)
-    except (KeyError, TypeError, ValueError):
-        return None
-
-
-def odometry_from_wire(fields: dict[str, Any], age: float = 0.0, overtaken: int = 0) -> Odometry | None:
-    """An ODOMETRY message (fields as on the wire, NED and FRD, `arrived` ns) in ENU and FLU.
-
-    The velocity is turned according to `child_frame_id`. None where a number that is needed is not there (PX4
-    sends NaN for an estimate it has not got) or the quaternion is not unit. Raises `ValueError` for a frame
-    that is unknown.
-    """
-    numbers = [fields[k] for k in ("x", "y", "z", "vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed")]
-    numbers += fields["q"]
-    if None in numbers or not math.isfinite(sum(numbers)):
-        return None
-    x, y, z, vx, vy, vz, p, q, r, w, i, j, k = numbers
-    size = w * w + i * i + j * j + k * k
-    if not 0.98 < size < 1.02:
-        return None
-    size = 1.0 / math.sqrt(size)
-    w, i, j, k = w * size, i * size, j * size, k * size
-    frame = fields["child_frame_id"]
-    if frame in _FRAMES_BODY_FRD:
-        # Body FRD to NED by the attitude: v + 2 q x (q x v + w v).
-        a, b, c = j * vz - k * vy + w * vx, k * vx - i * vz + w * vy, i * vy - j * vx + w * vz
-        vx, vy, vz = vx + 2 * (j * c - k * b), vy + 2 * (k * a - i * c), vz + 2 * (i * b - j * a)
-    elif frame not in _FRAMES_WORLD_NED:
-        raise ValueError(f"velocity in the frame {frame}, which is neither local NED nor body FRD")
-    # The same map as models.frames.enu_flu_from_ned_frd, for one sample.
-    attitude = (_ROOT_HALF * (w + k), _ROOT_HALF * (i + j), _ROOT_HALF * (i - j), _ROOT_HALF * (w - k))
-    return Odometry(
-        int(fields["time_usec"]),
-        fields["arrived"],
-        (y, x, -z),
-        (vy, vx, -vz),
-        attitude,
-        (p, -q, -r),
-        int(fields.get("reset_counter", 0)),
-        age,
-        overtaken,
-    )

@@ -17,7 +17,7 @@ from typing import Any
 
 import zenoh
 
-from trueflight.companion.vehicle_link import mode_name
+from trueflight.companion.latest import mode_name
 from trueflight.models import contract
 from trueflight.models.record_pb2 import Event, Tick
 

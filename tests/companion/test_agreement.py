@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trueflight.companion.agreement import Agreement, AgreementLimits, _turned, rotated
-from trueflight.companion.vehicle_link import ImuSample, Odometry
+from trueflight.companion.odometry import ImuSample, Odometry
 from trueflight.models import frames
 from trueflight.models.design import load_design
 from trueflight.models.reference import trajectory

@@ -21,10 +21,11 @@ from trueflight.companion.flight import (
     Outcome,
     Safety,
 )
+from trueflight.companion.latest import Latest
 from trueflight.companion.law.control import ControlLaw
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import Range, Watch
-from trueflight.companion.vehicle_link import Latest, Odometry
+from trueflight.companion.odometry import Odometry
 from trueflight.models.contract import FEATURES
 from trueflight.models.design import load_design
 from trueflight.models.errors import InputError

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mav
 from rig import PATIENT, Bridge, Companion, Wiretap, wait_for
 
+from trueflight.companion.odometry import vision_estimate
 from trueflight.companion.pose import PoseFeed, PoseGate, PoseSettings
-from trueflight.companion.vehicle_link import vision_estimate
 from trueflight.models import contract
 from trueflight.models.pose import Pose, pose_from_json, pose_to_json
 
@@ -43,26 +43,21 @@ class TestFrames:
     @given(coordinates, coordinates, coordinates, angles, st.floats(-1.5, 1.5), angles)
     def test_any_pose(self, x: float, y: float, z: float, roll: float, pitch: float, yaw: float) -> None:
         estimate = vision_estimate(Pose((x, y, z), quaternion(yaw, pitch, roll)), 7, 3)
-        position = estimate.position_body
-        np.testing.assert_allclose(
-            [position.x_m, position.y_m, position.z_m], self.NED_OF_ENU @ [x, y, z], atol=1e-12
-        )
+        np.testing.assert_allclose(estimate.position, self.NED_OF_ENU @ [x, y, z], atol=1e-12)
         flu_to_enu = elementary(2, yaw) @ elementary(1, pitch) @ elementary(0, roll)
         frd_to_ned = self.NED_OF_ENU @ flu_to_enu @ self.FRD_OF_FLU.T
-        told = estimate.angle_body
-        sent = elementary(2, told.yaw_rad) @ elementary(1, told.pitch_rad) @ elementary(0, told.roll_rad)
+        told_roll, told_pitch, told_yaw = estimate.angles
+        sent = elementary(2, told_yaw) @ elementary(1, told_pitch) @ elementary(0, told_roll)
         np.testing.assert_allclose(sent, frd_to_ned, atol=1e-9)
-        assert (estimate.time_usec, estimate.reset_counter) == (7, 3)
+        assert (estimate.taken_us, estimate.reset_counter) == (7, 3)
 
     def test_nose_to_the_east_is_ninety_degrees_from_north(self) -> None:
-        assert vision_estimate(Pose((0, 0, 0), LEVEL), 0, 0).angle_body.yaw_rad == pytest.approx(
-            0.5 * math.pi
-        )
+        assert vision_estimate(Pose((0, 0, 0), LEVEL), 0, 0).angles[2] == pytest.approx(0.5 * math.pi)
 
     def test_what_is_unknown_is_told_as_unknown(self) -> None:
-        (only,) = vision_estimate(Pose((0, 0, 0), LEVEL), 0, 0).pose_covariance.covariance_matrix
+        (only,) = vision_estimate(Pose((0, 0, 0), LEVEL), 0, 0).covariance
         assert math.isnan(only)
-        known = vision_estimate(Pose((0, 0, 0), LEVEL, 0, 0.1, 0.2), 0, 0).pose_covariance.covariance_matrix
+        known = vision_estimate(Pose((0, 0, 0), LEVEL, 0, 0.1, 0.2), 0, 0).covariance
         # The diagonal of the upper right triangle.
         assert [known[i] for i in (0, 6, 11, 15, 18, 20)] == pytest.approx([0.01] * 3 + [0.04] * 3)
         assert sum(known) == pytest.approx(0.15)

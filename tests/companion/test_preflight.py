@@ -14,11 +14,10 @@ import pytest
 from rig import VEHICLE, Bridge, free_port, wait_for
 from test_companion_cli import companion
 
-from trueflight.companion.message_rates import odometry_too_low
+from trueflight.companion.message_rates import Rates, odometry_too_low
 from trueflight.companion.pose import PoseSettings
 from trueflight.companion.preflight import hover_of, judge, required_parameters
 from trueflight.companion.settings import Settings
-from trueflight.companion.vehicle_link import Rates
 
 
 @pytest.fixture

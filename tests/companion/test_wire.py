@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from trueflight.companion.vehicle_link import mode_name, odometry_from_wire
+from trueflight.companion.latest import mode_name
+from trueflight.companion.odometry import odometry_from_wire
 from trueflight.models import frames
 
 LOCAL_NED, BODY_FRD = 1, 12

@@ -21,7 +21,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mav
 from rig import free_port
 
-from trueflight.companion.vehicle_link import mode_name
+from trueflight.companion.latest import mode_name
 
 HEARTBEAT, TIMESYNC, SET_ATTITUDE_TARGET, HIGHRES_IMU, ODOMETRY = 0, 111, 82, 105, 331
 
