@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from trueflight.groundstation.reading.plausible import held
+from trueflight.groundstation.reading.assemble import assemble
+from trueflight.groundstation.reading.rows import held
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS, Flight
 from trueflight.models.record import FlightRecord, read_record
@@ -37,8 +38,6 @@ def read_flight_record(path: Path, vehicle: str | Path | Vehicle | None = None) 
     `shadow_raw` (m/s², heading frame; 0 elsewhere). Raises `InputError` for a record without a vehicle, a
     flight, or any plausible column.
     """
-    from trueflight.groundstation.reading.flight_file import assemble
-
     record = read_record(path)
     believed = _vehicle(path, record, vehicle)
     ticks = record.ticks

@@ -12,9 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from trueflight.groundstation.reading.px4_flight import (
-    ACCELEROMETER,
-    FAST,
+from trueflight.groundstation.reading.px4_airborne import (
     RATE,
     Airborne,
     airborne,
@@ -24,6 +22,7 @@ from trueflight.groundstation.reading.px4_flight import (
     motor_count,
     period_mean,
 )
+from trueflight.groundstation.reading.px4_flight import ACCELEROMETER, FAST
 from trueflight.groundstation.reading.px4_log import Log
 from trueflight.groundstation.reading.px4_thrust import commanded_thrust
 from trueflight.models.errors import InputError

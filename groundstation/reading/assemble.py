@@ -1,0 +1,126 @@
+"""From columns, whatever they were read from, to a checked `Flight` on an even clock."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from trueflight.groundstation.reading import plausible, rows
+from trueflight.groundstation.reading.airborne import flying_mask
+from trueflight.groundstation.reading.uniform import MOST_LOST, even_clock
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.vehicle import Vehicle
+
+
+def assemble(
+    path: Path,
+    vehicle: Vehicle,
+    t: np.ndarray,
+    columns: dict[str, np.ndarray],
+    place: Callable[[int], str],
+    *,
+    extra: dict[str, np.ndarray] | None = None,
+    flying: np.ndarray | None = None,
+    commanded: np.ndarray | None = None,
+    notes: tuple[str, ...] = (),
+    most_lost: float = MOST_LOST,
+) -> Flight:
+    """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
+    find what was flown. `place(row)` names a row in messages; `most_lost` is the share of samples that gaps may
+    take. Raises `InputError` for anything that cannot be analysed."""
+    origin = str(path)
+    _check_groups(origin, columns)
+    columns, dead = rows.without_dead_battery(columns)
+    names = list(columns)
+    every = {
+        **rows.without_empty_attitude(columns),
+        **{f"extra {k}": v for k, v in (extra or {}).items()},
+    }
+    if flying is not None:
+        every["flying"] = np.asarray(flying, dtype=bool)
+    if commanded is not None:
+        every["commanded"] = np.asarray(commanded, dtype=bool)
+    t, every, mended = _whole_rows(t, every, names, place)
+    plausible.check_units({name: every[name] for name in names}, vehicle, origin)
+    t, every, resampled = even_clock(t, rows.continuous(every), origin, most_lost)
+    said = [*notes, *dead, *mended, *resampled]
+    given = {name: every[name] for name in names}
+    if "thrust_command" not in given:
+        given["thrust_command"] = given["motor_command"].mean(axis=1)
+        said.append("no collective command in the log: thrust_command is the mean of the motor commands")
+    in_air = every["flying"] if flying is not None else flying_mask(t, given, vehicle)
+    if commanded is not None:
+        in_air = in_air & every["commanded"]
+    said += _left_out(t, in_air, said, origin)
+    plausible.check_specific_force(given, in_air, origin)
+    plausible.check_attitude(t, given, in_air, origin)
+    plausible.check_motion(t, given, in_air, origin)
+    return Flight(
+        name=path.stem,
+        vehicle=vehicle,
+        t=t,
+        **given,  # type: ignore[arg-type]
+        flying=in_air,
+        accelerometer="specific_force" in given,
+        origin=origin,
+        data_hash=hashlib.sha256(path.read_bytes()).hexdigest(),
+        notes=tuple(said),
+        extra={n.removeprefix("extra "): column for n, column in every.items() if n.startswith("extra ")},
+    )
+
+
+def _whole_rows(
+    t: np.ndarray, every: dict[str, np.ndarray], names: list[str], place: Callable[[int], str]
+) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
+    """Clock and columns in order of time, each time once, and whole in the columns `names`; what was done to them."""
+    t, every, order, sorted_ = rows.in_order(t, every)
+
+    def sorted_place(row: int) -> str:
+        return place(int(order[min(row, len(order) - 1)]) if len(order) else 0)
+
+    plausible.check_clock(t, sorted_place)
+    t, every, repeated = rows.without_duplicates(t, every)
+    wanted = {name: every[name] for name in names}
+    _, whole, missing = rows.complete(t, {**wanted, "row": np.arange(len(t))}, sorted_place)
+    kept = whole.pop("row")
+    others = {name: column[kept] for name, column in every.items() if name not in wanted}
+    return t[kept], {**whole, **others}, [*sorted_, *repeated, *missing]
+
+
+def _left_out(t: np.ndarray, in_air: np.ndarray, said: list[str], origin: str) -> list[str]:
+    """What to say of the samples that are not in the air; raises `InputError` where too few are."""
+    seconds = float(in_air.sum()) * float(np.median(np.diff(t)))
+    if seconds < plausible.SHORTEST:
+        cut = " (the log may be cut short)" if any("cut" in note for note in said) else ""
+        raise InputError(
+            f"{origin}: only {seconds:.1f} s of {t[-1] - t[0]:.1f} s are in the air{cut}; at least "
+            f"{plausible.SHORTEST:g} s are needed: fly longer, or check hover_thrust of the vehicle file"
+        )
+    if np.all(in_air):
+        return []
+    first, last = t[in_air][0], t[in_air][-1]
+    return [
+        f"{seconds:.1f} s of {t[-1] - t[0]:.1f} s are in the air, between t = {first:.1f} and "
+        f"{last:.1f} s; the rest (ground, takeoff, landing, fragments) is left out"
+    ]
+
+
+def _check_groups(origin: str, columns: dict[str, np.ndarray]) -> None:
+    """What no analysis can do without: a command, and something that was measured in answer to it."""
+    if "thrust_command" not in columns and "motor_command" not in columns:
+        raise InputError(
+            f"{origin}: no thrust_command (nor motor_command_1..4): without the command nothing can be "
+            "predicted; add "
+            "the column, or name yours in a mapping (--mapping)"
+        )
+    moves = "quaternion" in columns and ("velocity" in columns or "position" in columns)
+    if "specific_force" not in columns and not moves:
+        raise InputError(
+            f"{origin}: neither an accelerometer (specific_force_x, y, z) nor attitude with velocity or "
+            "position "
+            "(quaternion_*, velocity_*); add one of them, or name yours in a mapping (--mapping)"
+        )
