@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 
@@ -119,10 +119,11 @@ def _code(text: CitedValue | str) -> Markup:
     return Markup(found)
 
 
-def environment(html: bool) -> Environment:
-    """Templates of the report, for HTML or for Markdown; whatever a template names must be there."""
+def environment(html: bool, *rooms: str) -> Environment:
+    """The templates of this room and of further `rooms` (packages), for HTML or for Markdown; whatever a template
+    names must be there."""
     made = Environment(
-        loader=PackageLoader("trueflight.groundstation.report"),
+        loader=ChoiceLoader([PackageLoader(room) for room in (__package__, *rooms)]),
         autoescape=html,
         undefined=StrictUndefined,
         trim_blocks=True,

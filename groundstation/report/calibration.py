@@ -278,7 +278,7 @@ CHARTS: tuple[Chart, ...] = (
 
 def render_calibration(table: Table) -> str:
     """The page as HTML. `table` is the JSON of the study."""
-    html, told = environment(html=True), CitedValue(table)
+    html, told = environment(True, __package__), CitedValue(table)
     bodies = []
     with style():
         for chart in CHARTS:

@@ -11,12 +11,12 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from trueflight.groundstation.evaluate.analysis import Analysis
+from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.evaluate.tracking import Tracking
 from trueflight.groundstation.output.cited import unit
 from trueflight.groundstation.report.svg import BESIDE, COLOURS, ERROR, LEVELS, figure, level, to_svg
 from trueflight.groundstation.results import Comparison
-from trueflight.groundstation.views.error import rolling_rms
 
 WIDTH = 7.4
 WINDOW = 12.0
@@ -126,7 +126,7 @@ def over_time(a: Analysis) -> Markup:
 
 
 def _residual(ax: Any, c: Comparison, colour: str, label: str, clock: float | None = None) -> None:
-    values = rolling_rms(c.residual, c.used, round(SMOOTHING / c.flight.dt))
+    values = error_over_time(c, SMOOTHING).values
     t = c.flight.t if clock is None else c.flight.t - c.flight.t[0] + clock
     step = max(1, len(t) // MOST)
     ax.plot(t[::step], values[::step], color=colour, linewidth=1.1, label=label)
@@ -198,15 +198,15 @@ def path(a: Analysis) -> Markup | None:
     c, flight = a.before, a.flight
     if flight.position is None:
         return None
-    values, highest = _scale(c)
+    error = error_over_time(c, SMOOTHING)
     good = np.all(np.isfinite(flight.position), axis=1)
-    if not np.any(good & np.isfinite(values)):
+    if not np.any(good & np.isfinite(error.values)):
         return None
     span = np.maximum(np.ptp(flight.position[good], axis=0), 0.4)
     tall = 3.0 * max(span[1], span[2]) / span[0]
     made, axes = figure(1, 2, WIDTH, 1.2 + float(np.clip(tall, 1.6, 3.4)))
     rows = np.flatnonzero(good)[:: max(1, int(good.sum()) // SEGMENTS)]
-    steps = level(values[rows], highest)
+    steps = level(error.values[rows], error.highest)
     for ax, (across, up), names in (
         (axes[0, 0], (0, 1), ("east, m", "north, m")),
         (axes[0, 1], (0, 2), ("east, m", "height, m")),
@@ -226,7 +226,7 @@ def path(a: Analysis) -> Markup | None:
         ax.set_ylabel(names[1])
     axes[0, 0].set_title("from above")
     axes[0, 1].set_title("from the south")
-    bounds = np.linspace(0.0, highest, LEVELS + 1)
+    bounds = np.linspace(0.0, error.highest, LEVELS + 1)
     patches = [Patch(color=ERROR[k], label=f"{bounds[k]:.2g}–{bounds[k + 1]:.2g}") for k in range(0, LEVELS)]
     made.legend(
         handles=patches, loc="outside lower center", ncols=LEVELS, frameon=False, fontsize=7.5,
@@ -238,13 +238,6 @@ def path(a: Analysis) -> Markup | None:
         f"The path from above and from the south, coloured by the residual of {c.label}; dark, thick parts are worst, "
         "the three worst moments are numbered.",
     )
-
-
-def _scale(c: Comparison) -> tuple[np.ndarray, float]:
-    """The residual along the flight, RMS over `SMOOTHING` s, and where its colours end."""
-    values = rolling_rms(c.residual, c.used, round(SMOOTHING / c.flight.dt))
-    finite = values[np.isfinite(values)]
-    return values, float(np.quantile(finite, 0.99)) if finite.size else 1.0
 
 
 def _coloured(ax: Any, points: np.ndarray, steps: np.ndarray) -> None:
@@ -276,7 +269,7 @@ def place(a: Analysis, table: Table) -> Markup | None:
     centres, rms = np.array(told["centres"]), np.array(told["rms"], dtype=float)
     made, axes = figure(1, 1, 4.2, 3.4)
     ax, cell = axes[0, 0], told["cell"]
-    steps = level(rms, _scale(a.before)[1])
+    steps = level(rms, error_over_time(a.before, SMOOTHING).highest)
     for k in range(LEVELS):
         cells = [Rectangle((x - cell / 2, y - cell / 2), cell, cell) for x, y in centres[steps == k]]
         if cells:

@@ -89,7 +89,7 @@ def chosen(without: Sequence[str]) -> tuple[Section, ...]:
 
 def render(analysis: Analysis, table: Table, sections: Sequence[Section] = SECTIONS) -> str:
     """The page as HTML. `table` is the JSON of `analysis`: every number in the page is read from it."""
-    html, told = environment(html=True), CitedValue(table)
+    html, told = environment(True, __package__), CitedValue(table)
     with style():
         bodies = [
             (section, _body(html, section, section.charts(analysis, table), told))
@@ -107,7 +107,7 @@ def render(analysis: Analysis, table: Table, sections: Sequence[Section] = SECTI
 def render_side_by_side(beside: SideBySide, table: Table) -> str:
     """A page of comparisons side by side alone; `table` holds their JSON under "side_by_side", and
     "provenance"."""
-    html, told = environment(html=True), CitedValue(table)
+    html, told = environment(True, __package__), CitedValue(table)
     wanted = {s.name: s for s in SECTIONS}
     with style():
         drawn = _beside(beside, table)

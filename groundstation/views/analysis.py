@@ -9,12 +9,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from trueflight.groundstation.evaluate.analysis import Analysis
+from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.output.as_json import analysis_table
 from trueflight.groundstation.output.cited import CitedValue, environment, sentences
 from trueflight.groundstation.views.bars import bar_groups
 from trueflight.groundstation.views.colour import NEWEST, WARNING, Colour, of_version
 from trueflight.groundstation.views.comparison import comparison_panel
-from trueflight.groundstation.views.error import error_curves, error_over_time, moments_log
+from trueflight.groundstation.views.error import error_curves, moments_log
 from trueflight.groundstation.views.recording import page, recording, text
 from trueflight.groundstation.views.side_by_side import side_by_side_panel
 from trueflight.groundstation.views.tracking import tracking_panel
@@ -51,7 +52,7 @@ def _tabs(stream: rr.RecordingStream, a: Analysis) -> rrb.Container:
 
 def _verdict(stream: rr.RecordingStream, a: Analysis, table: dict[str, Any]) -> rrb.Container:
     """Plain words and the ranking, the share of each effect, the waterfall, the error over time."""
-    markdown = environment(html=False)
+    markdown = environment(False, "trueflight.groundstation.views")
     words = sentences(table, html=False)
     told = CitedValue(table)
     text(stream, "verdict/words", "\n\n".join([f"## {words[0]}", *words[1:]]))

@@ -9,9 +9,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.results import Comparison, WhereItFails
 from trueflight.groundstation.views.colour import MEASURED, of_version
-from trueflight.groundstation.views.error import error_curves, error_over_time
+from trueflight.groundstation.views.error import error_curves
 from trueflight.groundstation.views.recording import between, curve, page, recording, text
 
 AXES = ("forward", "left", "up")

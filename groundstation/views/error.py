@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from trueflight.groundstation.results import Comparison, Moment
+from trueflight.groundstation.evaluate.error_over_time import ErrorOverTime
+from trueflight.groundstation.results import Moment
 from trueflight.groundstation.views import scene
 from trueflight.groundstation.views.bars import legend
 from trueflight.groundstation.views.colour import FLOOR, WARNING, Colour
@@ -17,34 +17,6 @@ from trueflight.groundstation.views.recording import TIME, between, curve
 
 MARKED = 3
 """Worst moments that are marked in space."""
-
-
-def rolling_rms(residual: np.ndarray, used: np.ndarray, width: int) -> np.ndarray:
-    """RMS (N,) per axis of a residual (N, 3) over `width` samples; nan where little of them counts."""
-    square = np.where(used, np.nanmean(np.where(used[:, None], residual, 0.0) ** 2, axis=1), 0.0)
-    window = np.ones(max(width, 1))
-    total, count = np.convolve(square, window, "same"), np.convolve(used.astype(float), window, "same")
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(count > 0.3 * len(window), np.sqrt(total / count), np.nan)
-
-
-@dataclass(frozen=True)
-class ErrorOverTime:
-    """The rolling RMS (N,) of a comparison's residual, m/s², and the value at which its colours end."""
-
-    comparison: Comparison
-    values: np.ndarray
-    highest: float
-    smoothing: float  # s
-
-
-def error_over_time(comparison: Comparison, smoothing: float, highest: float | None = None) -> ErrorOverTime:
-    """The residual of `comparison`, RMS over `smoothing` s; colours end at its 99th percentile unless told."""
-    values = rolling_rms(comparison.residual, comparison.used, round(smoothing / comparison.flight.dt))
-    finite = values[np.isfinite(values)]
-    if highest is None:
-        highest = float(np.quantile(finite, 0.99)) if finite.size else 1.0
-    return ErrorOverTime(comparison, values, highest, smoothing)
 
 
 def error_path(

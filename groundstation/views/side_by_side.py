@@ -8,10 +8,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.output.cited import written
 from trueflight.groundstation.views.colour import AXES, BETWEEN, LINEAR, NEWEST, REFERENCE, Colour
-from trueflight.groundstation.views.error import error_curves, error_legend, error_over_time, error_path
+from trueflight.groundstation.views.error import error_curves, error_legend, error_path
 from trueflight.groundstation.views.recording import page, recording, text
 
 COLOURS: tuple[Colour, ...] = (LINEAR, NEWEST, REFERENCE, *BETWEEN, *AXES)

@@ -9,10 +9,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.results import Comparison, WaterfallStep
 from trueflight.groundstation.views.bars import bar_groups
 from trueflight.groundstation.views.colour import FLOOR, NEWEST, Colour, of_version
-from trueflight.groundstation.views.error import error_curves, error_legend, error_over_time, error_path
+from trueflight.groundstation.views.error import error_curves, error_legend, error_path
 from trueflight.groundstation.views.recording import page, recording, text
 
 SMOOTHING = 0.5  # s

@@ -8,14 +8,13 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from trueflight.groundstation.evaluate.error_over_time import ErrorOverTime, error_over_time
 from trueflight.groundstation.results import Comparison, ErrorMap, PlaceMap, WhereItFails
 from trueflight.groundstation.views import scene
 from trueflight.groundstation.views.colour import FLOOR, NEWEST, REFERENCE, of_error
 from trueflight.groundstation.views.error import (
-    ErrorOverTime,
     error_curves,
     error_legend,
-    error_over_time,
     error_path,
     moments_log,
 )

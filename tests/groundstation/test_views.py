@@ -13,6 +13,7 @@ import pytest
 import rerun as rr
 
 from trueflight.groundstation.evaluate.compare import compare, waterfall
+from trueflight.groundstation.evaluate.error_over_time import rolling_rms
 from trueflight.groundstation.evaluate.tracking import Tracking
 from trueflight.groundstation.evaluate.where import where_it_fails
 from trueflight.groundstation.reading import read_flight
@@ -20,7 +21,6 @@ from trueflight.groundstation.results import WhereItFails
 from trueflight.groundstation.versions.store import add_effect
 from trueflight.groundstation.views import write_before_after, write_comparison, write_tracking, write_where
 from trueflight.groundstation.views.colour import of_error
-from trueflight.groundstation.views.error import rolling_rms
 from trueflight.groundstation.views.monitor import Monitor, state
 from trueflight.models.errors import InputError
 from trueflight.models.model import linear_model, rigid_body_model
