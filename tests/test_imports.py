@@ -2,6 +2,7 @@
 
 import ast
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,28 @@ OPENS_OR_SIGNS = {
     "models/access.py": {"cryptography"},
 }
 """The modules of models/ that both ends of Zenoh open their session and judge keys by."""
+
+
+ROOMS: dict[str, set[str]] = {
+    "results": set(),
+    "reading": set(),
+    "measured": set(),
+    "design": set(),
+    "operate": set(),
+    "identify": {"results", "reading", "measured", "design"},
+    "evaluate": {"results", "reading", "measured", "design", "identify"},
+    "learn": {"measured", "identify", "evaluate"},
+    "versions": {"reading", "measured", "identify"},
+    "output": {"results", "evaluate"},
+    "views": {"results", "operate", "evaluate", "learn", "output"},
+    "report": {"results", "evaluate", "output"},
+    "study": {"reading", "operate", "identify", "evaluate", "learn", "versions", "output"},
+    "commands": {
+        "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",
+        "views", "report", "study",
+    },
+}  # fmt: skip
+"""The rooms of groundstation/ from the bottom to the top, and what each may import: only what stands above it here."""
 
 
 def imports(path: Path) -> set[str]:
@@ -63,6 +86,50 @@ def test_a_package_imports_only_what_its_role_allows(package: str) -> None:
         )
         foreign = {_owner(name) for name in imports(path)} - STANDARD - allowed
         assert not foreign, f"{path.relative_to(ROOT)} imports {sorted(foreign)}"
+
+
+def modules(folder: str) -> dict[str, Path]:
+    """The modules of a folder by their full names."""
+    found = {}
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(["trueflight", *(parts[:-1] if parts[-1] == "__init__" else parts)])] = path
+    return found
+
+
+def arrows(folder: str) -> dict[str, set[str]]:
+    """Which modules of its own folder each module imports, for types too."""
+    known = modules(folder)
+    found: dict[str, set[str]] = {}
+    for module, path in known.items():
+        found[module] = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found[module] |= {alias.name for alias in node.names} & set(known)
+            elif isinstance(node, ast.ImportFrom):
+                named = [f"{node.module}.{alias.name}" for alias in node.names]
+                found[module] |= {name if name in known else str(node.module) for name in named} & set(known)
+    return found
+
+
+def test_rooms_import_only_what_stands_above_them() -> None:
+    for number, (room, allowed) in enumerate(ROOMS.items()):
+        assert allowed <= set(list(ROOMS)[:number]), f"{room}: {allowed} points down in the table of rooms"
+    between: dict[tuple[str, str], list[str]] = {}
+    for module, seen in arrows("groundstation").items():
+        for other in seen:
+            one, two = (name.split(".")[2] for name in (module, other))
+            if one != two:
+                between.setdefault((one, two), []).append(f"{module} imports {other}")
+    assert {room for pair in between for room in pair} <= set(ROOMS)
+    wrong = [said for (one, two), where in between.items() if two not in ROOMS[one] for said in where]
+    counted = f"{len(between)} arrows between {len(ROOMS)} rooms, {sum(map(len, between.values()))} imports"
+    assert not wrong, f"{'; '.join(sorted(wrong))} ({counted})"
+
+
+@pytest.mark.parametrize("folder", sorted(ALLOWED))
+def test_no_module_comes_back_to_itself_by_what_it_imports(folder: str) -> None:
+    tuple(TopologicalSorter(arrows(folder)).static_order())  # a CycleError names the circle
 
 
 @pytest.mark.parametrize("package", ["sim_bridge", "companion"])
