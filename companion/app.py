@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from trueflight.companion.director import Director
-from trueflight.companion.flight import IDLE, FlightStateMachine
+from trueflight.companion.flight import FlightStateMachine
 from trueflight.companion.law.control import ControlLaw
 from trueflight.companion.mission_request import SMALL, read_json, read_request
 from trueflight.companion.odometry import Odometry
+from trueflight.companion.outcome import IDLE
 from trueflight.companion.pose import PoseFeed
 from trueflight.companion.settings import Settings
 from trueflight.companion.signature import Signatures

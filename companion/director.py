@@ -16,24 +16,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from trueflight.companion.flight import (
-    IDLE,
-    LANDING,
-    MISSION,
-    SILENT,
-    TAKEOFF,
-    Decision,
-    FlightStateMachine,
-    Mission,
-    Safety,
-)
+from trueflight.companion.flight import Decision, FlightStateMachine, Mission
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import GuardLimits
 from trueflight.companion.message_rates import Rates, link_too_slow, odometry_too_low
 from trueflight.companion.mission_request import mission_request
+from trueflight.companion.outcome import IDLE, LANDING, MISSION, SILENT, TAKEOFF
 from trueflight.companion.pose import PoseFeed
 from trueflight.companion.records import Records
 from trueflight.companion.shadow import Shadow, ShadowLimits
+from trueflight.companion.stopping import Safety
 from trueflight.companion.store import ModelStore
 from trueflight.companion.vehicle_link import VehicleLink
 from trueflight.models.contract import CORRECTED

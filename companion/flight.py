@@ -1,6 +1,8 @@
 """One flight as the control thread sees it: phases, references, and every reason to stop.
 
-idle -> takeoff -> mission -> landing -> idle \\________|_________/ silent
+    idle -> takeoff -> mission -> landing -> idle
+               |          |          |
+               +----------+----------+-> silent -> idle
 
 `tick` is called with each odometry message and answers with what to send, or with nothing. Nothing is the
 safe answer: an autopilot in Offboard that hears no setpoint for COM_OF_LOSS_T takes over by itself. *The
@@ -23,7 +25,6 @@ from trueflight.companion.law.control import (
     IDLE_STEP,
     Attitude,
     ControlLaw,
-    ControlStep,
     State,
     euler,
     features,
@@ -32,8 +33,19 @@ from trueflight.companion.law.controllers import Controller, TrimLimits, make_co
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import Watch
 from trueflight.companion.odometry import Odometry
-from trueflight.companion.resets import Reset, found_reset
+from trueflight.companion.outcome import IDLE, LANDING, MISSION, SILENT, TAKEOFF, Outcome
+from trueflight.companion.resets import found_reset
 from trueflight.companion.shadow import Shadow, error_acceleration
+from trueflight.companion.stopping import (
+    RETURN,
+    SILENCE,
+    TELL,
+    ReasonsToStop,
+    Safety,
+    Stop,
+    motors_cut,
+    taken_over,
+)
 from trueflight.models.contract import CONTROLLERS, CORRECTED
 from trueflight.models.errors import InputError
 from trueflight.models.reference import Trajectory, transfer
@@ -41,66 +53,11 @@ from trueflight.models.trajectory import ReferenceSample, Waypoint, path
 
 Vector = tuple[float, float, float]
 
-IDLE, TAKEOFF, MISSION, LANDING, SILENT = "idle", "takeoff", "mission", "landing", "silent"
 _SETTLED_DISTANCE, _SETTLED_SPEED = 0.15, 0.25
 _LAND_FROM = 0.4  # m above ground at which the autopilot's own Land mode takes the last bit
 _PROVING_MOVE = 0.6
 """m, aside and (half of it) up, of the moves before a mission by which a model from the ground is judged."""
 _PROVING_LAPS = 3
-_TUMBLED = 1.4
-"""rad of tilt, twice what the cascade may ask for: a vehicle there for longer than `_TUMBLING` s has crashed, or
-nothing that a linear design sends can bring it back."""
-_TUMBLING = 0.5
-_MODE_UNKNOWN = 2.5
-"""s of the vehicle's clock without a word of mode and arming after which nothing is sent until they are told again.
-
-PX4 sends HEARTBEAT once a second whatever is asked for, and CURRENT_MODE (from 1.15 on) twice a second and at once when
-the mode changes: two heartbeats may be lost."""
-
-
-@dataclass(frozen=True)
-class Safety:
-    """Where a flight may go and when it must end.
-
-    The fence is a cylinder around home: `fence_radius`, `fence_height` in m. `takeoff_voltage` and
-    `land_voltage` are shares of the nominal voltage; the latter ends a flight when it lasts
-    `battery_patience` s. `odometry_gap` s of the vehicle's clock without odometry end a flight, as do a position that
-    moves `jump` m otherwise than its velocity between two messages, a distance of `lost` m from the reference and an
-    estimator that knows its horizontal position to no better than `position_accuracy` m. Where the estimator tells of a
-    reset, up to `reset` m and `reset_turn` rad of heading are taken for a better view of the same place, and the flight
-    goes on from there. A flight lands when for `late_patience` s setpoints answer to odometry older than `late` s; no
-    setpoint leaves that answers to odometry older than `stale` s: the flight falls silent then.
-    `climb_speed` and `transfer_speed` in m/s.
-    """
-
-    fence_radius: float = 10.0
-    fence_height: float = 8.0
-    takeoff_voltage: float = 0.90
-    land_voltage: float = 0.80
-    battery_patience: float = 2.0
-    odometry_gap: float = 0.25
-    jump: float = 0.3
-    reset: float = 1.0
-    reset_turn: float = 0.35
-    late: float = 0.1
-    late_patience: float = 0.3
-    stale: float = 0.5
-    lost: float = 4.0
-    position_accuracy: float = 2.0
-    climb_speed: float = 0.8
-    transfer_speed: float = 1.5
-
-    def check_trajectory(self, trajectory: Trajectory) -> str:
-        """'' where the whole reference lies inside the fence and above ground, otherwise the reason."""
-        (x0, y0, z0), (x1, y1, z1) = trajectory.bounds
-        radius = max(math.hypot(x, y) for x in (x0, x1) for y in (y0, y1))
-        if z0 < 0.05:
-            return f"it goes down to {z0:.2f} m above ground; keep it above 0.05 m"
-        if z1 > self.fence_height:
-            return f"it climbs to {z1:.1f} m, the fence ends at {self.fence_height:g} m"
-        if radius > self.fence_radius:
-            return f"it may go {radius:.1f} m from home, the fence ends at {self.fence_radius:g} m"
-        return ""
 
 
 @dataclass(frozen=True)
@@ -154,30 +111,6 @@ class Decision:
     reason: str = ""
 
 
-@dataclass(slots=True)
-class Outcome:
-    """What one tick decided: `step` and `reference` are None where nothing is sent.
-
-    `model` is the live one's hash, whether it acts or not; `shadow` that of the model in the shadow, and
-    `shadow_raw` what it returned (m/s², heading frame). `age` in s: from the moment of the odometry, by the vehicle's
-    clock, to the answer.
-    """
-
-    phase: str
-    interval: float
-    position: Vector
-    step: ControlStep | None = None
-    reference: ReferenceSample | None = None
-    guard: str = "off"
-    inference: float = 0.0
-    controller: str = ""
-    model: str = ""
-    trajectory: str = ""
-    shadow: str = ""
-    shadow_raw: Vector = (0.0, 0.0, 0.0)
-    age: float = 0.0
-
-
 @dataclass
 class FlightStateMachine:
     """The state machine of a flight; `tick` belongs to the control thread, the rest may be called from any.
@@ -209,15 +142,10 @@ class FlightStateMachine:
     _leg_begin: float = 0.0
     _now: float = 0.0
     _previous: Odometry | None = None
-    _heard_again: int = 0
-    """Time of the vehicle's (µs) at which odometry came again after a gap."""
-    _low_since: float = math.inf
-    _tumbled_since: float = math.inf
-    _late_since: float = math.inf
     _handed_over: bool = False
     """The autopilot lands by its own mode: nothing is sent any more, whatever mode comes after."""
     agrees: Agreement = field(init=False)
-    _reset: Reset | None = None
+    reasons: ReasonsToStop = field(init=False)
     _turned: float = 0.0
     """rad by which resets have turned the heading since takeoff, and with it the reference's."""
     _yaw: float = 0.0
@@ -230,6 +158,7 @@ class FlightStateMachine:
 
     def __post_init__(self) -> None:
         self.agrees = Agreement(self.agreement)
+        self.reasons = ReasonsToStop(self.safety, self.law.vehicle.nominal_voltage)
 
     # Orders
 
@@ -243,8 +172,8 @@ class FlightStateMachine:
                 self._controller = make_controller(mission.controller, self.law, mission.guard, self.trim)
                 self._legs.clear()
                 self._leg, self.wants_land, self._handed_over = None, False, False
-                self._low_since = self._tumbled_since = self._late_since = math.inf
-                self._turned, self._reset, self._heard_again = 0.0, None, 0
+                self.reasons.begin()
+                self._turned = 0.0
 
         self._orders.append(order)
 
@@ -355,8 +284,9 @@ class FlightStateMachine:
         out.age = age
         if out.step is None:
             return False
-        if age > self.safety.stale:
-            self._stale(age)
+        stale = self.reasons.stale(age)
+        if stale is not None:
+            self._stop(stale)
             out.step, out.phase, self._sending = None, self.phase, False
             self.sent -= 1
         return out.step is not None
@@ -371,7 +301,10 @@ class FlightStateMachine:
         odometry, out = self._unwatched
         self.agrees.step(odometry, latest.imu_sample)
         if self._leg is not None and self.phase not in (IDLE, SILENT):
-            self._watch(odometry, out, latest)
+            for reason in self.reasons.look(
+                odometry, out, latest, self._here[:3], self.agrees.reason, self.wants_land
+            ):
+                self._stop(reason)
             self._watch_guard()
             if out.step is not None:
                 self._watch_candidate(odometry, out, latest)
@@ -382,8 +315,7 @@ class FlightStateMachine:
         if previous is not None:
             interval = 1e-6 * (odometry.vehicle_time_us - previous.vehicle_time_us)
         self._now = 1e-6 * odometry.vehicle_time_us
-        if interval / (1 + odometry.overtaken) > self.safety.odometry_gap:
-            self._heard_again = odometry.vehicle_time_us
+        self.reasons.hear(odometry, interval)
         w, x, y, z = odometry.quaternion
         self._yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         if self._leg is not None and previous is not None:
@@ -407,18 +339,17 @@ class FlightStateMachine:
         if mission.guard is not None:
             out.model = mission.guard.live
         if self._leg is None:
-            out.step = IDLE_STEP if odometry.age <= self.safety.stale else None
+            out.step = IDLE_STEP if self.reasons.stale(odometry.age) is None else None
             return out
         if latest.flight_mode != "OFFBOARD" or self._handed_over:
             return out  # landing by the autopilot's own mode
-        if odometry.age > self.safety.stale:
-            self._stale(odometry.age)
+        stale = self.reasons.stale(odometry.age)
+        if stale is not None:
+            self._stop(stale)
             out.phase = self.phase
             return out
-        told = latest.mode_time_us
-        since = max(odometry.vehicle_time_us - round(1e6 * _MODE_UNKNOWN), self._heard_again)
-        if told is not None and told < since:
-            return out  # somebody else may fly by now, also where nothing was heard for a while
+        if self.reasons.mode_unknown(odometry, latest):
+            return out
         out.reference = self._reference(position, odometry)
         out.phase = self.phase
         guard = mission.guard
@@ -512,7 +443,7 @@ class FlightStateMachine:
         (hx, hy, hz), (dx, dy, dz) = self.home, reset.moved
         self.home = hx + dx, hy + dy, hz + dz
         self._turned += reset.turned
-        self._reset = reset
+        self.reasons.reset = reset
 
     def _preview(self, ahead: float) -> ReferenceSample:
         """The reference of this leg `ahead` s from now; it holds still after the leg's end."""
@@ -545,85 +476,29 @@ class FlightStateMachine:
         """The pilot wins, so do the autopilot's failsafes, and a vehicle that is not armed flies no more."""
         if self._leg is None:  # streaming, not yet armed by us: `take_off` follows only on armed and Offboard
             return
-        if (latest.killed or latest.flight_mode == "TERMINATION") and self.phase != SILENT:
-            self._silence("kill_switch", f"the motors were cut{_because(latest)}: silent")
+        cut = motors_cut(latest)
+        if cut is not None and self.phase != SILENT:
+            self._stop(cut)
         if not latest.armed:
             if self.phase != LANDING and not self.outcome:
                 self.outcome = "the vehicle was disarmed in flight"
                 self.on_event("error", "disarmed", self.outcome)
             self._finish(self.outcome or "finished")
-        elif latest.flight_mode != "OFFBOARD" and self.phase != SILENT:
+        elif self.phase != SILENT:
+            taken = taken_over(latest)
             if self.wants_land and latest.flight_mode == "LAND":
                 self._handed_over = True
-                return
-            if latest.failsafe:
-                text = (
-                    f"{latest.flight_mode} was chosen by the autopilot's failsafe{_because(latest)}: silent"
-                )
-                self._silence("failsafe", text)
-            else:
-                who = f"the pilot or a ground station{_because(latest)}"
-                text = f"{latest.flight_mode} was chosen by {who}: silent"
-                self._silence("pilot_takeover", text)
+            elif taken is not None:
+                self._stop(taken)
 
-    def _watch(self, odometry: Odometry, out: Outcome, latest: Latest) -> None:
-        safety, interval, position, age = self.safety, out.interval, out.position, out.age
-        if latest.flight_mode != "OFFBOARD":
-            return
-        _, x, y, _ = odometry.quaternion
-        tumbled = 1.0 - 2.0 * (x * x + y * y) < math.cos(_TUMBLED)  # body z against the vertical
-        self._tumbled_since = min(self._tumbled_since, self._now) if tumbled else math.inf
-        if self._now - self._tumbled_since > _TUMBLING:
-            self._silence("tumbled", f"tilted by more than {math.degrees(_TUMBLED):.0f} degrees: silent")
-            return
-        reset, self._reset = self._reset, None
-        if self.wants_land:
-            return
-        gap = interval / (1 + odometry.overtaken)  # those overtaken have arrived
-        if gap > safety.odometry_gap or interval < 0.0:
-            what = f"missing for {gap:.2f} s" if interval > 0.0 else "going back in time"
-            self._land(f"odometry was {what}", return_home=False, kind="odometry_gap")
-            return
-        if interval > safety.odometry_gap:
-            text = (
-                f"this machine stood still for {interval:.2f} s; {odometry.overtaken} messages were overtaken"
-            )
-            self.on_event("warning", "stalled", text)
-        if reset is not None and self._watch_reset(reset):
-            return
-        if self.agrees.reason:
-            self._land(self.agrees.reason, return_home=False, kind="odometry_disagrees")
-            return
-        late = max(odometry.age, age) > safety.late
-        self._late_since = min(self._late_since, self._now) if late else math.inf
-        if self._now - self._late_since > safety.late_patience:
-            text = f"setpoints answer to odometry that is {age:.2f} s old; {safety.late:g} s are allowed"
-            self._land(text, return_home=False, kind="late")
-            return
-        if math.hypot(position[0], position[1]) > safety.fence_radius or position[2] > safety.fence_height:
-            self._land("outside the geofence", return_home=False, kind="geofence")
-            return
-        if math.dist(position, self._here[:3]) > safety.lost:
-            self._land(f"more than {safety.lost:g} m from the reference", return_home=False, kind="lost")
-            return
-        low = 0.0 < latest.battery_voltage < safety.land_voltage * self.law.vehicle.nominal_voltage
-        self._low_since = min(self._low_since, self._now) if low else math.inf
-        if self._now - self._low_since > safety.battery_patience and self.phase != LANDING:
-            self._land(f"battery at {latest.battery_voltage:.1f} V", return_home=True, kind="battery_low")
-
-    def _watch_reset(self, reset: Reset) -> bool:
-        """Tell of a reset of the estimate; whether the flight lands for it. Home has been carried over already."""
-        safety = self.safety
-        if not reset.told:
-            kind = "position_jump" if reset.distance > safety.jump else "heading_jump"
-            self._land(f"{reset.text}, and the estimator told of no reset", return_home=False, kind=kind)
-            return True
-        if reset.distance > safety.reset or abs(reset.turned) > safety.reset_turn:
-            self._land(f"the estimator was reset: {reset.text}", return_home=False, kind="estimator_reset")
-            return True
-        carried = "; home and reference are carried over" if reset.moves else ""
-        self.on_event("warning", "estimator_reset", f"the estimator was reset: {reset.text}{carried}")
-        return False
+    def _stop(self, reason: Stop) -> None:
+        """Do what a reason to stop asks for."""
+        if reason.act == SILENCE:
+            self._silence(reason.kind, reason.text)
+        elif reason.act == TELL:
+            self.on_event("warning", reason.kind, reason.text)
+        else:
+            self._land(reason.text, reason.act == RETURN, reason.kind)
 
     def _watch_guard(self) -> None:
         """Tell where the guard went back to the last good model by itself."""
@@ -694,11 +569,6 @@ class FlightStateMachine:
             self._leg, self._leg_begin = Leg(LANDING, transfer(stay, stay, 1.0, 1.0), name="stay"), self._now
             self.phase, self.wants_land = LANDING, True
 
-    def _stale(self, age: float) -> None:
-        """Nothing may leave any more: what is known of the vehicle is too old, and with it who flies it."""
-        text = f"the odometry to answer to is {age:.2f} s old, {self.safety.stale:g} s are allowed: silent"
-        self._silence("stale", text)
-
     def _silence(self, kind: str, text: str) -> None:
         self.phase, self.wants_land = SILENT, False
         self.outcome = self.outcome or text
@@ -712,11 +582,6 @@ class FlightStateMachine:
         shadow, self.candidate = self.candidate, None
         if shadow is not None:
             self.decisions.append(Decision("undecided", shadow.name))
-
-
-def _because(latest: Latest) -> str:
-    """What the autopilot told just now, in brackets."""
-    return f" ({latest.why})" if latest.why else ""
 
 
 def _finite(force: Vector | None) -> Vector | None:

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from trueflight.companion.agreement import AgreementLimits
-from trueflight.companion.flight import Safety
 from trueflight.companion.law.control import Limits
 from trueflight.companion.law.controllers import TrimLimits
 from trueflight.companion.law.watch import GuardLimits
 from trueflight.companion.pose import PoseSettings
 from trueflight.companion.shadow import ShadowLimits
 from trueflight.companion.signature import LOCAL, UNSIGNED
+from trueflight.companion.stopping import Safety
 from trueflight.companion.zenoh_session import ZenohSettings
 from trueflight.models.access import Keys, read_keys
 from trueflight.models.errors import InputError

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from trueflight.companion.flight import Outcome
 from trueflight.companion.latest import Latest
 from trueflight.companion.odometry import Odometry
+from trueflight.companion.outcome import Outcome
 from trueflight.models.record_pb2 import Tick
 
 

@@ -7,7 +7,8 @@ import math
 import pytest
 from test_flight import Rig, fly, kinds
 
-from trueflight.companion.flight import LANDING, MISSION, SILENT, Safety
+from trueflight.companion.outcome import LANDING, MISSION, SILENT
+from trueflight.companion.stopping import Safety
 
 
 def hovering() -> Rig:

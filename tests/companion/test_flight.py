@@ -10,22 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trueflight.companion.flight import (
-    IDLE,
-    LANDING,
-    MISSION,
-    SILENT,
-    TAKEOFF,
-    FlightStateMachine,
-    Mission,
-    Outcome,
-    Safety,
-)
+from trueflight.companion.flight import FlightStateMachine, Mission
 from trueflight.companion.latest import Latest
 from trueflight.companion.law.control import ControlLaw
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import Range, Watch
 from trueflight.companion.odometry import Odometry
+from trueflight.companion.outcome import IDLE, LANDING, MISSION, SILENT, TAKEOFF, Outcome
+from trueflight.companion.stopping import Safety
 from trueflight.models.contract import FEATURES
 from trueflight.models.design import load_design
 from trueflight.models.errors import InputError

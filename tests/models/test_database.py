@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trueflight.companion.flight import Safety
+from trueflight.companion.stopping import Safety
 from trueflight.models.database import EMPTIEST, FULLEST, Collection, database, record_name
 from trueflight.models.errors import InputError
 
