@@ -1,8 +1,8 @@
 """The phases of a flight, and what one tick of it decided.
 
-    idle -> takeoff -> mission -> landing -> idle
-               |          |          |
-               +----------+----------+-> silent -> idle
+idle -> takeoff -> mission -> landing -> idle
+           |          |          |
+           +----------+----------+-> silent -> idle
 """
 
 from __future__ import annotations
