@@ -113,8 +113,21 @@ def analyse(
 
     Raises `InputError` where the flight lacks what a comparison needs.
     """
-    base = line[-1]
-    diagnosis = diagnose(flight, base, validation, bandwidth, progress)
+    diagnosis = diagnose(flight, line[-1], validation, bandwidth, progress)
+    return gather(diagnosis, line, validation, bandwidth, design, side_by_side, progress)
+
+
+def gather(
+    diagnosis: Diagnosis,
+    line: Sequence[Model],
+    validation: Flight | None = None,
+    bandwidth: float | None = None,
+    design: Design | None = None,
+    side_by_side: SideBySide | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Analysis:
+    """All there is to see beside a `diagnosis` that was made from the last model of `line`, as `analyse` has it."""
+    flight, base = diagnosis.flight, line[-1]
     progress("adding the effects one by one")
     models = [*line, *steps_to(diagnosis, bandwidth)]
     if models[0].terms or models[0].network is not None:

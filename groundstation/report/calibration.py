@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from trueflight.groundstation.evaluate.calibration import NOTHING, OUTCOMES
 from trueflight.groundstation.output.cited import CitedValue, environment
 from trueflight.groundstation.report.page import write_report
-from trueflight.groundstation.report.svg import COLOURS, LIGHT, figure, light_style, style, to_svg
+from trueflight.groundstation.report.svg import COLOURS, LIGHT, Drawing, figure, light_style, style, to_svg
 from trueflight.models.whole_file import whole_file
 
 Table = dict[str, Any]
@@ -283,7 +283,7 @@ def render_calibration(table: Table) -> str:
     with style():
         for chart in CHARTS:
             if table[chart.needs]:
-                drawn = to_svg(chart.draw(table, COLOURS), chart.name, chart.alt)
+                drawn = to_svg(Drawing(chart.draw(table, COLOURS), chart.name, chart.alt))
                 body = html.get_template(f"calibration/{chart.name}.html").render(t=told, chart=drawn)
                 bodies.append(({"name": chart.name, "title": chart.title}, Markup(body)))
     body = html.get_template("calibration/wrong.html").render(t=told)

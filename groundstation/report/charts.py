@@ -1,22 +1,22 @@
-"""The charts of the report. What has a number in the JSON table is drawn from that table."""
+"""The charts of the report. What has a number in the JSON is drawn from that: a `table` is what `output.as_json` makes
+of a result."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from trueflight.groundstation.evaluate.analysis import Analysis
 from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.evaluate.tracking import Tracking
 from trueflight.groundstation.output.cited import unit
-from trueflight.groundstation.report.svg import BESIDE, COLOURS, ERROR, LEVELS, figure, level, to_svg
-from trueflight.groundstation.results import Comparison
+from trueflight.groundstation.report.svg import BESIDE, COLOURS, LEVELS, Colours, Drawing, figure, level
+from trueflight.groundstation.results import Comparison, Moment
 
 WIDTH = 7.4
 WINDOW = 12.0
@@ -29,9 +29,8 @@ SMOOTHING = 0.5  # s
 Table = dict[str, Any]
 
 
-def waterfall(table: Table) -> Markup:
-    """The residual as effects are added, fitted and held out."""
-    steps = table["waterfall"]
+def waterfall(steps: Sequence[Table], colours: Colours = COLOURS) -> Drawing:
+    """The residual as effects are added, fitted and held out; `steps` as in the JSON's "waterfall"."""
     held = all(s["held_out"] is not None for s in steps)
     made, axes = figure(1, 1, WIDTH, 0.55 + 0.42 * len(steps))
     ax, height = axes[0, 0], 0.38 if held else 0.6
@@ -40,15 +39,15 @@ def waterfall(table: Table) -> Markup:
         y - (0.2 if held else 0.0),
         [s["fitted"] for s in steps],
         height,
-        color=COLOURS["after"],
+        color=colours["after"],
         label="fitted flight",
     )
     if held:
         ax.barh(
-            y + 0.2, [s["held_out"] for s in steps], height, color=COLOURS["held"], label="held-out flight"
+            y + 0.2, [s["held_out"] for s in steps], height, color=colours["held"], label="held-out flight"
         )
     ax.axvline(
-        steps[-1]["noise_floor"], color=COLOURS["ink"], linewidth=1.2, dashes=(4, 2), label="noise floor"
+        steps[-1]["noise_floor"], color=colours["ink"], linewidth=1.2, dashes=(4, 2), label="noise floor"
     )
     ax.set_yticks(y, [s["label"] for s in steps])
     ax.invert_yaxis()
@@ -58,38 +57,38 @@ def waterfall(table: Table) -> Markup:
     told = "; ".join(
         f"{s['label']} {s['fitted']:.3f}" + (f", held out {s['held_out']:.3f}" if held else "") for s in steps
     )
-    return to_svg(made, "waterfall", f"Bars of the residual RMS in m/s² by model version: {told}.")
+    return Drawing(made, "waterfall", f"Bars of the residual RMS in m/s² by model version: {told}.")
 
 
-def prediction(a: Analysis) -> Markup:
-    """Measured and predicted acceleration around the worst moment, per axis."""
-    flight = a.flight
-    middle = (
-        0.5 * (a.where.worst[0].start + a.where.worst[0].end) if a.where.worst else float(np.median(flight.t))
-    )
+def prediction(
+    before: Comparison, after: Comparison, worst: Sequence[Moment], colours: Colours = COLOURS
+) -> Drawing:
+    """Measured and predicted acceleration around the worst moment, per axis; `after` may be `before` itself."""
+    flight = before.flight
+    middle = 0.5 * (worst[0].start + worst[0].end) if worst else float(np.median(flight.t))
     last = max(float(flight.t[0]), float(flight.t[-1]) - WINDOW)
     start = float(np.clip(middle - 0.5 * WINDOW, flight.t[0], last))
     rows = np.flatnonzero((flight.t >= start) & (flight.t <= start + WINDOW))[:: max(1, len(flight) // 20000)]
-    shown = [k for k in range(3) if np.any(np.isfinite(a.before.measured[rows, k]))]
+    shown = [k for k in range(3) if np.any(np.isfinite(before.measured[rows, k]))]
     made, axes = figure(len(shown), 1, WIDTH, 0.5 + 1.35 * len(shown), sharex=True)
     t = flight.t[rows]
     for ax, k in zip(axes[:, 0], shown, strict=True):
-        ax.plot(t, a.before.measured[rows, k], color=COLOURS["measured"], linewidth=2.4, label="measured")
-        curves = [(a.before, COLOURS["before"])]
-        if a.after is not a.before:
-            curves.append((a.after, COLOURS["after"]))
+        ax.plot(t, before.measured[rows, k], color=colours["measured"], linewidth=2.4, label="measured")
+        curves = [(before, colours["before"])]
+        if after is not before:
+            curves.append((after, colours["after"]))
         for c, colour in curves:
             ax.plot(t, c.predicted[rows, k], color=colour, linewidth=1.1, label=c.label)
         ax.set_ylabel(f"{'xyz'[k]}, m/s²")
-        for m in a.where.worst:
+        for m in worst:
             if m.start < t[-1] and m.end > t[0]:
                 ax.axvspan(
-                    max(m.start, t[0]), min(m.end, t[-1]), color=COLOURS["worst"], alpha=0.18, linewidth=0
+                    max(m.start, t[0]), min(m.end, t[-1]), color=colours["worst"], alpha=0.18, linewidth=0
                 )
     axes[-1, 0].set_xlabel("time, s (worst moments shaded)")
     axes[0, 0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2)
     names = " and ".join(c.label for c, _ in curves)
-    return to_svg(
+    return Drawing(
         made,
         "prediction",
         f"Measured acceleration in the heading frame and that of {names}, from {start:.0f} to "
@@ -97,28 +96,30 @@ def prediction(a: Analysis) -> Markup:
     )
 
 
-def over_time(a: Analysis) -> Markup:
-    """The residual over the whole flight, the worst moments marked."""
+def over_time(
+    before: Comparison, after: Comparison, worst: Sequence[Moment], colours: Colours = COLOURS
+) -> Drawing:
+    """The residual over the whole flight, the worst moments marked; `after` may be `before` itself."""
     made, axes = figure(1, 1, WIDTH, 1.9)
     ax = axes[0, 0]
-    curves = [(a.before, COLOURS["before"])]
-    if a.after is not a.before:
-        curves.append((a.after, COLOURS["after"]))
+    curves = [(before, colours["before"])]
+    if after is not before:
+        curves.append((after, colours["after"]))
     for c, colour in curves:
         _residual(ax, c, colour, c.label)
-    ax.axhline(a.before.noise_floor, color=COLOURS["ink"], linewidth=1.0, dashes=(4, 2), label="noise floor")
-    for number, m in enumerate(a.where.worst, 1):
-        ax.axvspan(m.start, m.end, color=COLOURS["worst"], alpha=0.3, linewidth=0)
+    ax.axhline(before.noise_floor, color=colours["ink"], linewidth=1.0, dashes=(4, 2), label="noise floor")
+    for number, m in enumerate(worst, 1):
+        ax.axvspan(m.start, m.end, color=colours["worst"], alpha=0.3, linewidth=0)
         ax.annotate(
             str(number), (0.5 * (m.start + m.end), 1.0), xycoords=("data", "axes fraction"),
-            ha="center", va="bottom", fontsize=7.0, color=COLOURS["ink"],
+            ha="center", va="bottom", fontsize=7.0, color=colours["ink"],
         )  # fmt: skip
     ax.set_ylim(bottom=0.0)
-    ax.set_xlim(a.flight.t[0], a.flight.t[-1])
+    ax.set_xlim(before.flight.t[0], before.flight.t[-1])
     ax.set_xlabel("time, s")
     ax.set_ylabel("m/s²")
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.08), ncols=3, borderaxespad=0.2)
-    return to_svg(
+    return Drawing(
         made,
         "overtime",
         f"Residual RMS over {SMOOTHING:g} s along the flight, worst moments numbered and shaded.",
@@ -132,22 +133,21 @@ def _residual(ax: Any, c: Comparison, colour: str, label: str, clock: float | No
     ax.plot(t[::step], values[::step], color=colour, linewidth=1.1, label=label)
 
 
-def maps(table: Table) -> Markup:
-    """The residual over each variable, before and after, in the same bins."""
-    before = [m for m in table["where"]["maps"] if m["variable"] != "time"]
-    left = {m["variable"]: m for m in table["where_left"]["maps"]}
-    models = table["comparison"]["models"]
-    names = models[table["comparison"]["first"]]["model"], models[-1]["model"]
+def maps(table: Table, left_table: Table, names: tuple[str, str], colours: Colours = COLOURS) -> Drawing:
+    """The residual over each variable, before and after, in the same bins; tables as in the JSON's "where". With both
+    `names` the same, before alone."""
+    before = [m for m in table["maps"] if m["variable"] != "time"]
+    left = {m["variable"]: m for m in left_table["maps"]}
     made, axes = _grid(len(before))
     for ax, m in zip(axes, before, strict=False):
         edges = np.array(m["edges"])
-        _stairs(ax, edges, m["rms"], COLOURS["before"], names[0], filled=True)
+        _stairs(ax, edges, m["rms"], colours["before"], names[0], filled=True)
         if names[1] != names[0]:
-            _stairs(ax, edges, left[m["variable"]]["rms"], COLOURS["after"], names[1], filled=False)
+            _stairs(ax, edges, left[m["variable"]]["rms"], colours["after"], names[1], filled=False)
         _label(ax, m)
-    _names(made, axes[0])
+    _names(made, axes[0], colours)
     told = ", ".join(m["variable"] for m in before)
-    return to_svg(made, "maps", f"Residual RMS in m/s² over {told}; the numbers stand in the tables below.")
+    return Drawing(made, "maps", f"Residual RMS in m/s² over {told}; the numbers stand in the tables below.")
 
 
 def _grid(count: int) -> tuple[Any, list[Any]]:
@@ -159,10 +159,10 @@ def _grid(count: int) -> tuple[Any, list[Any]]:
     return made, flat
 
 
-def _names(made: Any, ax: Any) -> None:
+def _names(made: Any, ax: Any, colours: Colours) -> None:
     """One legend for all panels, above them."""
     handles, labels = ax.get_legend_handles_labels()
-    made.legend(handles, labels, loc="outside upper right", ncols=4, frameon=False, labelcolor=COLOURS["ink"])
+    made.legend(handles, labels, loc="outside upper right", ncols=4, frameon=False, labelcolor=colours["ink"])
 
 
 def _stairs(
@@ -193,9 +193,9 @@ def _label(ax: Any, m: Table) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(4))
 
 
-def path(a: Analysis) -> Markup | None:
-    """The path from above and from the south, coloured by the residual of the base; None without position."""
-    c, flight = a.before, a.flight
+def path(c: Comparison, worst: Sequence[Moment], colours: Colours = COLOURS) -> Drawing | None:
+    """The path from above and from the south, coloured by the residual of `c`; None without position."""
+    flight = c.flight
     if flight.position is None:
         return None
     error = error_over_time(c, SMOOTHING)
@@ -212,14 +212,14 @@ def path(a: Analysis) -> Markup | None:
         (axes[0, 1], (0, 2), ("east, m", "height, m")),
     ):
         points = flight.position[rows][:, [across, up]]
-        _coloured(ax, points, steps)
-        for number, m in enumerate(a.where.worst[:3], 1):
+        _coloured(ax, points, steps, colours)
+        for number, m in enumerate(worst[:3], 1):
             k = int(np.argmin(np.abs(flight.t - 0.5 * (m.start + m.end))))
             place = flight.position[k, [across, up]]
             ax.plot(
-                *place, marker="o", markersize=9, markerfacecolor="none", color=COLOURS["ink"], linewidth=1
+                *place, marker="o", markersize=9, markerfacecolor="none", color=colours["ink"], linewidth=1
             )
-            ax.annotate(str(number), place, xytext=(6, 6), textcoords="offset points", color=COLOURS["ink"])
+            ax.annotate(str(number), place, xytext=(6, 6), textcoords="offset points", color=colours["ink"])
         ax.set_aspect("equal", adjustable="datalim")
         ax.autoscale_view()
         ax.set_xlabel(names[0])
@@ -227,12 +227,14 @@ def path(a: Analysis) -> Markup | None:
     axes[0, 0].set_title("from above")
     axes[0, 1].set_title("from the south")
     bounds = np.linspace(0.0, error.highest, LEVELS + 1)
-    patches = [Patch(color=ERROR[k], label=f"{bounds[k]:.2g}–{bounds[k + 1]:.2g}") for k in range(0, LEVELS)]
+    patches = [
+        Patch(color=colours[f"e{k}"], label=f"{bounds[k]:.2g}–{bounds[k + 1]:.2g}") for k in range(0, LEVELS)
+    ]
     made.legend(
         handles=patches, loc="outside lower center", ncols=LEVELS, frameon=False, fontsize=7.5,
-        title="residual RMS, m/s²", labelcolor=COLOURS["ink"], handlelength=1.0, columnspacing=0.9,
+        title="residual RMS, m/s²", labelcolor=colours["ink"], handlelength=1.0, columnspacing=0.9,
     )  # fmt: skip
-    return to_svg(
+    return Drawing(
         made,
         "path",
         f"The path from above and from the south, coloured by the residual of {c.label}; dark, thick parts are worst, "
@@ -240,14 +242,14 @@ def path(a: Analysis) -> Markup | None:
     )
 
 
-def _coloured(ax: Any, points: np.ndarray, steps: np.ndarray) -> None:
+def _coloured(ax: Any, points: np.ndarray, steps: np.ndarray, colours: Colours) -> None:
     """A path (N, 2) in the colours of its steps (N,), the worst on top."""
     for k in range(-1, LEVELS):
         chosen = np.flatnonzero(steps[:-1] == k)
         if not len(chosen):
             continue
         lines = np.stack([points[chosen], points[chosen + 1]], axis=1)
-        colour = COLOURS["grid"] if k < 0 else ERROR[k]
+        colour = colours["grid" if k < 0 else f"e{k}"]
         # round caps close the joints between differently coloured pieces
         ax.add_collection(
             LineCollection(
@@ -261,77 +263,77 @@ def _coloured(ax: Any, points: np.ndarray, steps: np.ndarray) -> None:
     ax.plot(points[:, 0], points[:, 1], alpha=0.0)
 
 
-def place(a: Analysis, table: Table) -> Markup | None:
-    """The residual over the ground, in cells and in the colours of the path; None without position."""
-    told = table["where"]["place"]
+def place(c: Comparison, table: Table, colours: Colours = COLOURS) -> Drawing | None:
+    """The residual of `c` over the ground, in cells and in the colours of the path; None without position. `table` as
+    in the JSON's "where"."""
+    told = table["place"]
     if told is None:
         return None
     centres, rms = np.array(told["centres"]), np.array(told["rms"], dtype=float)
     made, axes = figure(1, 1, 4.2, 3.4)
     ax, cell = axes[0, 0], told["cell"]
-    steps = level(rms, error_over_time(a.before, SMOOTHING).highest)
+    steps = level(rms, error_over_time(c, SMOOTHING).highest)
     for k in range(LEVELS):
         cells = [Rectangle((x - cell / 2, y - cell / 2), cell, cell) for x, y in centres[steps == k]]
         if cells:
             ax.add_collection(
-                PatchCollection(cells, facecolors=[ERROR[k]], edgecolors="none", antialiased=False)
+                PatchCollection(cells, facecolors=[colours[f"e{k}"]], edgecolors="none", antialiased=False)
             )
     ax.plot(centres[:, 0], centres[:, 1], alpha=0.0)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("east, m")
     ax.set_ylabel("north, m")
-    return to_svg(
+    return Drawing(
         made,
         "place",
         f"Residual RMS over the ground in cells of {cell:g} m, from {rms.min():.2f} to {rms.max():.2f} m/s².",
     )
 
 
-def tracking(t: Tracking) -> Markup:
+def tracking(t: Tracking, colours: Colours = COLOURS) -> Drawing:
     """Distance to the expected linear behaviour, per axis."""
     made, axes = figure(3, 1, WIDTH, 3.4, sharex=True)
     gaps = np.concatenate([[False], np.diff(t.t) > 0.2])
     step = max(1, len(t.t) // MOST)
     for k, ax in enumerate(axes[:, 0]):
         error = 100 * np.where(gaps, np.nan, t.position[:, k] - t.expected[:, k])
-        ax.plot(t.t[::step], error[::step], color=COLOURS["after"], linewidth=1.1)
+        ax.plot(t.t[::step], error[::step], color=colours["after"], linewidth=1.1)
         ax.set_ylabel(f"{'xyz'[k]}, cm")
-        ax.axhline(0.0, color=COLOURS["muted"], linewidth=0.7)
+        ax.axhline(0.0, color=colours["muted"], linewidth=0.7)
     axes[-1, 0].set_xlabel("time, s")
-    return to_svg(
+    return Drawing(
         made, "tracking", "Flown minus expected position of the linear design along each world axis, cm."
     )
 
 
-def beside_maps(table: Table) -> Markup:
-    """The residual of every comparison over the same bins."""
-    beside = table["side_by_side"]
+def beside_maps(beside: Table, colours: Colours = COLOURS) -> Drawing:
+    """The residual of every comparison over the same bins; `beside` as in the JSON's "side_by_side"."""
     shown = [m for m in beside["maps"] if m["variable"] != "time"]
     made, axes = _grid(len(shown))
     for ax, m in zip(axes, shown, strict=False):
         for k, row in enumerate(beside["rows"]):
             if m["rms"][k] is not None:
-                colour = BESIDE[k % len(BESIDE)]
+                colour = colours[f"s{k % BESIDE}"]
                 _stairs(ax, np.array(m["edges"]), m["rms"][k], colour, row["name"], filled=False)
         _label(ax, m)
-    _names(made, axes[0])
+    _names(made, axes[0], colours)
     names = " and ".join(row["name"] for row in beside["rows"])
-    return to_svg(
+    return Drawing(
         made, "beside", f"Residual RMS of {names} over the same bins; the numbers stand in the tables below."
     )
 
 
-def beside_over_time(beside: SideBySide) -> Markup:
+def beside_over_time(beside: SideBySide, colours: Colours = COLOURS) -> Drawing:
     """The residual of every comparison over time, flights from their start."""
     made, axes = figure(1, 1, WIDTH, 1.9)
     ax = axes[0, 0]
     for k, (name, c) in enumerate(zip(beside.names, beside.comparisons, strict=True)):
-        _residual(ax, c, BESIDE[k % len(BESIDE)], name, clock=0.0)
+        _residual(ax, c, colours[f"s{k % BESIDE}"], name, clock=0.0)
     ax.set_ylim(bottom=0.0)
     ax.set_xlabel("time since the start of the flight, s")
     ax.set_ylabel("m/s²")
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2)
-    return to_svg(
+    return Drawing(
         made,
         "besidetime",
         f"Residual RMS over {SMOOTHING:g} s of {' and '.join(beside.names)} along the flight.",

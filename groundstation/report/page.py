@@ -13,12 +13,12 @@ from trueflight.groundstation.evaluate.analysis import Analysis
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.output.cited import CitedValue, environment, sentences
 from trueflight.groundstation.report import charts
-from trueflight.groundstation.report.svg import style
+from trueflight.groundstation.report.svg import Drawing, style, to_svg
 from trueflight.models.errors import InputError
 from trueflight.models.whole_file import write_whole
 
 Table = dict[str, Any]
-Charts = dict[str, Markup | None]
+Charts = dict[str, Drawing | None]
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,25 @@ def _none(a: Analysis, table: Table) -> Charts:
 
 SECTIONS: tuple[Section, ...] = (
     Section("ranking", "Which effect is missing", _none),
-    Section("waterfall", "The error as effects are added", lambda a, t: {"bars": charts.waterfall(t)}),
+    Section(
+        "waterfall", "The error as effects are added", lambda a, t: {"bars": charts.waterfall(t["waterfall"])}
+    ),
     Section(
         "prediction",
         "Measured and predicted",
-        lambda a, t: {"window": charts.prediction(a), "over_time": charts.over_time(a)},
+        lambda a, t: {
+            "window": charts.prediction(a.before, a.after, a.where.worst),
+            "over_time": charts.over_time(a.before, a.after, a.where.worst),
+        },
     ),
     Section(
         "where",
         "Where it fails",
-        lambda a, t: {"path": charts.path(a), "maps": charts.maps(t), "place": charts.place(a, t)},
+        lambda a, t: {
+            "path": charts.path(a.before, a.where.worst),
+            "maps": charts.maps(t["where"], t["where_left"], (a.before.label, a.after.label)),
+            "place": charts.place(a.before, t["where"]),
+        },
     ),
     Section("worst", "Worst moments", _none),
     Section(
@@ -75,7 +84,7 @@ SECTIONS: tuple[Section, ...] = (
 def _beside(beside: SideBySide | None, table: Table) -> Charts:
     if beside is None:
         return {}
-    return {"maps": charts.beside_maps(table), "over_time": charts.beside_over_time(beside)}
+    return {"maps": charts.beside_maps(table["side_by_side"]), "over_time": charts.beside_over_time(beside)}
 
 
 def chosen(without: Sequence[str]) -> tuple[Section, ...]:
@@ -122,7 +131,8 @@ def render_side_by_side(beside: SideBySide, table: Table) -> str:
 
 
 def _body(html: Any, section: Section, drawn: Charts, told: CitedValue) -> Markup:
-    return Markup(html.get_template(section.template).render(t=told, chart=drawn))
+    inline = {name: None if drawing is None else to_svg(drawing) for name, drawing in drawn.items()}
+    return Markup(html.get_template(section.template).render(t=told, chart=inline))
 
 
 def write_report(path: Path, text: str) -> None:

@@ -4,27 +4,37 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
-COLOURS = {
-    # stand-ins that the page's stylesheet gives a value, in light and in dark
-    name: f"#00{number:02x}01"
-    for number, name in enumerate(
-        ("ink", "muted", "grid", "measured", "linear", "before", "after", "held", "floor", "worst"), 1
-    )
-}
 LEVELS = 8
 """Steps of the error's scale."""
-ERROR = tuple(f"#00{number:02x}02" for number in range(LEVELS))
-BESIDE = tuple(f"#00{number:02x}03" for number in range(6))
-"""What is compared side by side."""
+BESIDE = 6
+"""Colours of what is compared side by side."""
 
-LIGHT = {
+Colours = Mapping[str, str]
+"""What the parts of a chart are drawn in: a colour for ink, muted, grid, measured, before, after, ...; for e0 to e7,
+the error's scale; and for s0 to s5, what is side by side."""
+
+COLOURS: Colours = {
+    # stand-ins that the page's stylesheet gives a value, in light and in dark
+    **{
+        name: f"#00{number:02x}01"
+        for number, name in enumerate(
+            ("ink", "muted", "grid", "measured", "linear", "before", "after", "held", "floor", "worst"), 1
+        )
+    },
+    **{f"e{number}": f"#00{number:02x}02" for number in range(LEVELS)},
+    **{f"s{number}": f"#00{number:02x}03" for number in range(BESIDE)},
+}
+
+LIGHT: Colours = {
     "ink": "#1b1f24",
     "muted": "#5b636e",
     "grid": "#dde1e6",
@@ -35,8 +45,32 @@ LIGHT = {
     "held": "#00835f",
     "floor": "#777777",
     "worst": "#e69f00",
+    "e0": "#f3e5a1",
+    "e1": "#f5cf78",
+    "e2": "#f3b054",
+    "e3": "#ea8a42",
+    "e4": "#d9633f",
+    "e5": "#bb3f4e",
+    "e6": "#8f2761",
+    "e7": "#571a63",
+    "s0": "#d55e00",
+    "s1": "#0b6bb5",
+    "s2": "#00835f",
+    "s3": "#b8860b",
+    "s4": "#b3568c",
+    "s5": "#555555",
 }
 """What the page's stylesheet gives them in light, for a picture that stands alone."""
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A drawn chart: `name` tells it from the others of a page, `alt` says in words what it shows."""
+
+    figure: Figure
+    name: str
+    alt: str
+
 
 STYLE = {
     "svg.fonttype": "none",
@@ -87,10 +121,11 @@ def light_style() -> AbstractContextManager[None]:
     return matplotlib.rc_context({k: given.get(v, v) if isinstance(v, str) else v for k, v in STYLE.items()})
 
 
-def to_svg(made: Figure, name: str, alt: str) -> Markup:
-    """The figure as one inline element; `alt` says in words what it shows."""
+def to_svg(chart: Drawing) -> Markup:
+    """The chart, drawn in `COLOURS`, as one inline element."""
+    name, alt = chart.name, chart.alt
     out = io.StringIO()
-    made.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
+    chart.figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
     text = out.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
@@ -98,11 +133,7 @@ def to_svg(made: Figure, name: str, alt: str) -> Markup:
     text = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', text)
     text = re.sub(r'xlink:href="#([^"]+)"', rf'href="#{name}-\1"', text)
     text = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", text)
-    for key, colour in (
-        *COLOURS.items(),
-        *((f"e{k}", c) for k, c in enumerate(ERROR)),
-        *((f"s{k}", c) for k, c in enumerate(BESIDE)),
-    ):
+    for key, colour in COLOURS.items():
         text = text.replace(colour, f"var(--{key})")
     box = re.search(r'viewBox="([^"]+)"', text)
     assert box is not None
