@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections import deque
 from enum import IntEnum
 
+from trueflight.sim_bridge.failsafes import Breach, Stop, breaches, failsafe_event, without_offboard
+from trueflight.sim_bridge.land_detector import LandDetector, Landed
 from trueflight.sim_bridge.modes import Mode
+from trueflight.sim_bridge.navigator import Navigator
 from trueflight.sim_bridge.parameters import Parameters
 from trueflight.sim_bridge.position_control import (
-    FREE,
-    UNSET,
     AttitudeSetpoint,
-    MotionSetpoint,
     PositionControl,
     RateSetpoint,
     Setpoint,
@@ -28,18 +27,7 @@ from trueflight.sim_bridge.world import PHYSICS_STEP
 _OUTER_STEPS = 5  # position loop and supervision at 100 Hz
 _ATTITUDE_STEPS = 2  # attitude loop at 250 Hz, PX4's
 _ESTIMATOR_START = 1.0  # s until the estimator gives a position
-_LANDED_AFTER = 0.5  # s of contact, slow and without thrust
 _EMPTY = 0.05  # state of charge below which arming is denied
-_BATTERY_CRITICAL = 4  # PX4's failsafe_cause_t
-
-
-class Landed(IntEnum):
-    """MAV_LANDED_STATE."""
-
-    ON_GROUND = 1
-    IN_AIR = 2
-    TAKEOFF = 3
-    LANDING = 4
 
 
 class Verdict(IntEnum):
@@ -67,35 +55,39 @@ class Autopilot:
         self.mode = Mode.HOLD
         self.armed = False
         self.killed = False
-        self.landed = Landed.ON_GROUND
         self.pilot_present = False
         self.failsafe = ""
         self.notices: deque[tuple[int, str]] = deque(maxlen=50)
         self.events: deque[tuple[str, int, bytes]] = deque(maxlen=50)
-        self.home: Vector = simulator.estimate().position
+        self._ground = LandDetector()
+        self._navigator = Navigator(parameters, simulator.estimate().position)
         self.thrust = 0.0
         self.rates: Vector = (0.0, 0.0, 0.0)
         self.attitude: AttitudeSetpoint | None = None
         self._offboard: Setpoint | None = None
         self._offboard_us = -(10**12)
-        self._target: MotionSetpoint = MotionSetpoint()
         self._steps = 0
         self.armed_us = 0
-        self._landed_us = 0
-        self._quiet_us: int | None = None
-        self._flown = False
 
     @property
     def time_us(self) -> int:
         """The vehicle's clock."""
         return self.simulator.time_us
 
+    @property
+    def landed(self) -> Landed:
+        """Where the vehicle is between ground and air, as far as it knows."""
+        return self._ground.state
+
+    @property
+    def home(self) -> Vector:
+        """Where the vehicle was armed, m, world."""
+        return self._navigator.home
+
     # Requests
 
     def offboard(self, setpoint: Setpoint) -> None:
-        """Take a setpoint from the companion; it acts in Offboard, and keeps Offboard available in other
-        modes.
-        """
+        """Take a setpoint from the companion; it acts in Offboard, and keeps Offboard available in other modes."""
         self._offboard = setpoint
         self._offboard_us = self.time_us
 
@@ -118,21 +110,12 @@ class Autopilot:
     def _enter(self, mode: Mode) -> None:
         if mode is self.mode:
             return
-        now = self.simulator.estimate()
         self.mode = mode
         self.attitude = None
         if mode is not Mode.OFFBOARD:
             # Offboard by rates leaves no trace in the position loop; start it from what flies now.
             self.control.reset()
-        x, y, z = now.position
-        yaw = yaw_of(now.quaternion)
-        if mode is Mode.TAKEOFF:
-            self._target = MotionSetpoint((x, y, z + self.parameters["MIS_TAKEOFF_ALT"]), yaw=yaw)
-        elif mode is Mode.RTL:
-            height = max(z, self.home[2] + self.parameters["RTL_RETURN_ALT"])
-            self._target = MotionSetpoint((x, y, height), yaw=yaw)
-        else:
-            self._target = MotionSetpoint((x, y, z), yaw=yaw)
+        self._navigator.aim(mode, self.simulator.estimate())
 
     def takeoff(self, height: float | None = None) -> Verdict:
         """Climb to `height` m above the present position (default MIS_TAKEOFF_ALT) and hold."""
@@ -141,7 +124,7 @@ class Autopilot:
         self._enter(Mode.TAKEOFF)
         if height is not None:
             x, y, z = self.simulator.estimate().position
-            self._target = MotionSetpoint((x, y, z + height), yaw=self._target.yaw)
+            self._navigator.aim_at((x, y, z + height), math.nan)
         return Verdict.ACCEPTED
 
     def reposition(self, position: Vector, yaw: float) -> Verdict:
@@ -149,30 +132,21 @@ class Autopilot:
         if not self.armed or self.landed is Landed.ON_GROUND:
             return Verdict.DENIED
         self._enter(Mode.HOLD)
-        x, y, z = (
-            new if math.isfinite(new) else old
-            for new, old in zip(position, self._target.position, strict=True)
-        )
-        self._target = MotionSetpoint((x, y, z), yaw=self._target.yaw if math.isnan(yaw) else yaw)
+        self._navigator.aim_at(position, yaw)
         return Verdict.ACCEPTED
 
     def arming_refusals(self) -> list[str]:
         """Why arming is denied now; empty when it is not."""
-        reasons = []
-        now = self.simulator.estimate()
-        if self.killed:
-            reasons.append("kill switch engaged")
-        if self.time_us < _ESTIMATOR_START * 1e6:
-            reasons.append("no valid position estimate yet")
-        if self.simulator.airframe.battery.charge < _EMPTY:
-            reasons.append("battery empty")
-        if tilt_of(now.quaternion) > math.radians(45):
-            reasons.append("attitude failure: vehicle is tilted")
-        if self.mode is Mode.OFFBOARD and not self.offboard_alive:
-            reasons.append("no offboard signal")
-        if self.mode.by_pilot and not self.pilot_present:
-            reasons.append("no manual control input")
-        return reasons
+        tilt = tilt_of(self.simulator.estimate().quaternion)
+        refusals = {
+            "kill switch engaged": self.killed,
+            "no valid position estimate yet": self.time_us < _ESTIMATOR_START * 1e6,
+            "battery empty": self.simulator.airframe.battery.charge < _EMPTY,
+            "attitude failure: vehicle is tilted": tilt > math.radians(45),
+            "no offboard signal": self.mode is Mode.OFFBOARD and not self.offboard_alive,
+            "no manual control input": self.mode.by_pilot and not self.pilot_present,
+        }
+        return [refusal for refusal, holds in refusals.items() if holds]
 
     def arm(self, force: bool = False) -> Verdict:
         """Start the motors at idle."""
@@ -185,9 +159,9 @@ class Autopilot:
             return Verdict.TEMPORARILY_REJECTED
         self.armed = True
         self.armed_us = self.time_us
-        self._flown = False
+        self._ground.arm()
         self.failsafe = ""
-        self.home = self.simulator.estimate().position
+        self._navigator.home = self.simulator.estimate().position
         self.control.reset()
         self.simulator.rates.reset()
         mode, self.mode = self.mode, Mode.READY
@@ -239,8 +213,7 @@ class Autopilot:
             self.simulator.rest()
             return
         if self.mode is Mode.OFFBOARD and isinstance(self._offboard, RateSetpoint):
-            # Straight through: a rate setpoint acts in the step after its arrival, not at the next outer
-            # tick.
+            # Straight through: a rate setpoint acts in the step after its arrival, not at the next outer tick.
             self.attitude = None
             self.thrust, self.rates = self._offboard.thrust, self._offboard.rates
         if self.landed is Landed.ON_GROUND and self.thrust < 0.5 * self.simulator.vehicle.hover_thrust:
@@ -249,41 +222,21 @@ class Autopilot:
 
     def _steer(self, dt: float) -> None:
         now = self.simulator.estimate()
-        setpoint: Setpoint = self._target
+        setpoint: Setpoint
         if self.mode is Mode.OFFBOARD and self._offboard is not None:
             setpoint = self._offboard
-        elif self.mode is Mode.LAND:
-            down = -self.parameters["MPC_LAND_SPEED"]
-            x, y, _ = self._target.position
-            blind = self.failsafe == "descend"
-            # PX4's Descend lets go of the horizontal position: level attitude, vertical speed only.
-            setpoint = MotionSetpoint(
-                FREE if blind else (x, y, UNSET),
-                (UNSET, UNSET, down) if blind else (0.0, 0.0, down),
-                yaw=self._target.yaw,
-            )
-        elif self.mode is Mode.TAKEOFF:
-            x, y, z = self._target.position
-            climb = min(self.parameters["MPC_TKO_SPEED"], self.parameters["MPC_Z_P"] * (z - now.position[2]))
-            setpoint = MotionSetpoint((x, y, UNSET), (0.0, 0.0, climb), yaw=self._target.yaw)
-            if z - now.position[2] < 0.15:
-                self._enter(Mode.HOLD)
-                self._target = MotionSetpoint((x, y, z), yaw=setpoint.yaw)
-        elif self.mode is Mode.RTL:
-            self._return_home(now.position)
-            setpoint = self._target
-        elif self.mode in (Mode.MANUAL, Mode.STABILIZED, Mode.ACRO):
-            # Sticks centred: level, at the thrust that hovers.
-            level = attitude_of_thrust((0.0, 0.0, 1.0), self._target.yaw)
-            setpoint = AttitudeSetpoint(self.parameters["MPC_THR_HOVER"], level)
-        elif self.mode is Mode.ALTCTL:
-            setpoint = MotionSetpoint((UNSET, UNSET, self._target.position[2]), yaw=self._target.yaw)
+        else:
+            setpoint = self._navigator.setpoint(self.mode, now, self.failsafe == "descend")
+            if (following := self._navigator.next_mode(self.mode, now)) is not None:
+                target = self._navigator.target
+                self._enter(following)
+                self._navigator.target = target
         if isinstance(setpoint, RateSetpoint):
             return
         if isinstance(setpoint, AttitudeSetpoint):
             self.attitude = setpoint
             return
-        if self.landed is Landed.ON_GROUND and not self._wants_up(setpoint, now.position[2]):
+        if self.landed is Landed.ON_GROUND and not setpoint.climbs_from(now.position[2]):
             # On the ground PX4 idles until something asks to climb.
             self.control.reset()
             level = attitude_of_thrust((0.0, 0.0, 1.0), yaw_of(now.quaternion))
@@ -291,109 +244,49 @@ class Autopilot:
             return
         self.attitude = self.control.attitude(setpoint, now, dt)
 
-    @staticmethod
-    def _wants_up(setpoint: MotionSetpoint, z: float) -> bool:
-        return setpoint.position[2] > z + 0.1 or setpoint.velocity[2] > 0.05 or setpoint.acceleration[2] > 0.5
-
-    def _return_home(self, position: Vector) -> None:
-        z = self._target.position[2]
-        hx, hy, _ = self.home
-        if abs(position[2] - z) < 0.5:
-            self._target = MotionSetpoint((hx, hy, z), yaw=self._target.yaw)
-            if math.hypot(position[0] - hx, position[1] - hy) < 0.5:
-                self._enter(Mode.LAND)
-                self._target = MotionSetpoint((hx, hy, z), yaw=self._target.yaw)
-
     # Supervision
 
     def _supervise(self) -> None:
-        self._detect_landing()
+        idle = not self.armed or self.thrust < 0.6 * self.parameters["MPC_THR_HOVER"]
+        if self._ground.step(self.simulator.world, self.time_us, idle, self.mode is Mode.LAND):
+            self.notices.append((6, "Landing detected"))
         if not self.armed:
             return
-        now = self.time_us
         if self.mode is Mode.OFFBOARD and not self.offboard_alive:
             self._offboard_lost()
         self._watch_failsafes()
-        if self.landed is Landed.ON_GROUND:
-            after_flight = self.parameters["COM_DISARM_LAND"]
-            before_flight = self.parameters["COM_DISARM_PRFLT"]
-            if self._flown and after_flight > 0 and now - self._landed_us > after_flight * 1e6:
-                self._stop("Disarmed by landing")
-            elif not self._flown and before_flight > 0 and now - self.armed_us > before_flight * 1e6:
-                self._stop("Disarmed by auto preflight disarming")
+        if reason := self._ground.reason_to_disarm(self.parameters, self.time_us, self.armed_us):
+            self._stop(reason)
 
     def _offboard_lost(self) -> None:
-        action = int(self.parameters["COM_OBL_RC_ACT"])
         self.notices.append((3, "Failsafe: offboard control lost"))
-        if action in (0, 1, 2, -1) and not self.pilot_present:
-            # The pilot's modes need a pilot; without one PX4 ends in a descent without position control.
-            self.failsafe = "descend"
-            self._enter(Mode.LAND)
-            return
-        self.failsafe = "offboard lost"
-        if action == 6:
+        self.failsafe, reaction = without_offboard(self.parameters, self.pilot_present)
+        if reaction is Stop.KILL:
             self.kill()
-        elif action == 7:
+        elif reaction is Stop.DISARM:
             self._stop("Disarmed by failsafe")
         else:
-            pilot = {0: Mode.POSCTL, 1: Mode.ALTCTL, 2: Mode.STABILIZED, -1: Mode.POSCTL}
-            self._enter({**pilot, 3: Mode.RTL, 4: Mode.LAND, 5: Mode.HOLD}[action])
+            self._enter(reaction)
 
     def _watch_failsafes(self) -> None:
         """Geofence and battery, each acting once a flight and only in the air, as PX4's do by their parameters."""
         if self.landed is Landed.ON_GROUND:
             return
-        parameters, state = self.parameters, self.simulator.estimate()
-        x, y, z = (now - home for now, home in zip(state.position, self.home, strict=True))
-        across, up = parameters["GF_MAX_HOR_DIST"], parameters["GF_MAX_VER_DIST"]
-        outside = 0.0 < across < math.hypot(x, y) or 0.0 < up < z
-        if outside and self.failsafe != "geofence":
-            self.events.append(("check_gf_violation", 3, struct.pack("<IB", 0xFFFFFFFF, 0)))
-            self._fail(
-                "geofence", {2: Mode.HOLD, 3: Mode.RTL, 5: Mode.LAND}.get(int(parameters["GF_ACTION"])), 0
-            )
-        charge = self.simulator.airframe.battery.charge
-        critical = charge < parameters["BAT_CRIT_THR"]
-        if critical and self.failsafe != "battery":
-            action = int(parameters["COM_LOW_BAT_ACT"])
-            self._fail("battery", {2: Mode.LAND, 3: Mode.RTL}.get(action), _BATTERY_CRITICAL)
+        x, y, z = (
+            now - home for now, home in zip(self.simulator.estimate().position, self.home, strict=True)
+        )
+        for breach in breaches(self.parameters, (x, y, z), self.simulator.airframe.battery.charge):
+            if self.failsafe != breach.what:
+                self._react(breach)
 
-    def _fail(self, what: str, mode: Mode | None, cause: int) -> None:
-        """Enter a failsafe's mode (None: warn only) and tell it; the numbers are those of PX4's enumerations."""
-        self.failsafe = what if mode is not None else self.failsafe
-        if mode is None or mode is self.mode:
+    def _react(self, breach: Breach) -> None:
+        """Enter a failsafe's mode and tell it; a breach without a mode is told only."""
+        self.events.extend(breach.events)
+        mode = breach.mode
+        if mode is None:
             return
-        before = self.mode.custom_mode
-        action = {Mode.HOLD: 5, Mode.RTL: 6, Mode.LAND: 7}[mode]
-        self.notices.append((2, "Failsafe activated"))
-        name = "commander_failsafe_enter" if cause else "commander_failsafe_enter_generic"
-        self.events.append((name, 2, struct.pack("<IBB", before, action, cause)))
-        self._enter(mode)
-
-    def _detect_landing(self) -> None:
-        world = self.simulator.world
-        hover = self.parameters["MPC_THR_HOVER"]
-        touching = world.touching
-        vx, vy, vz = world.velocity[0], world.velocity[1], world.velocity[2]
-        height = world.position[2] - world.standing_height
-        if self.landed is Landed.ON_GROUND:
-            if not touching and height > 0.05:
-                self.landed = Landed.TAKEOFF
-                self._flown = True
-            return
-        slow = abs(vz) < 0.25 and math.hypot(vx, vy) < 0.5
-        idle = not self.armed or self.thrust < 0.6 * hover
-        if touching and slow and idle:
-            if self._quiet_us is None:
-                self._quiet_us = self.time_us
-            if self.time_us - self._quiet_us > _LANDED_AFTER * 1e6:
-                self.landed = Landed.ON_GROUND
-                self._landed_us = self.time_us
-                self.notices.append((6, "Landing detected"))
-                self._quiet_us = None
-            return
-        self._quiet_us = None
-        if self.mode is Mode.LAND:
-            self.landed = Landed.LANDING
-        elif self.landed is not Landed.TAKEOFF or height > 0.5:
-            self.landed = Landed.IN_AIR
+        self.failsafe = breach.what
+        if mode is not self.mode:
+            self.notices.append((2, "Failsafe activated"))
+            self.events.append(failsafe_event(self.mode, mode, breach.cause))
+            self._enter(mode)

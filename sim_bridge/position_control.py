@@ -48,6 +48,10 @@ class MotionSetpoint:
     yaw: float = UNSET
     yaw_rate: float = UNSET
 
+    def climbs_from(self, z: float) -> bool:
+        """Whether it leads up from a height (m): only then does a vehicle leave the ground."""
+        return self.position[2] > z + 0.1 or self.velocity[2] > 0.05 or self.acceleration[2] > 0.5
+
 
 Setpoint = RateSetpoint | AttitudeSetpoint | MotionSetpoint
 

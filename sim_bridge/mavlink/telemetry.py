@@ -11,7 +11,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mav
 
-from trueflight.sim_bridge.autopilot import Autopilot, Landed
+from trueflight.sim_bridge.autopilot import Autopilot
+from trueflight.sim_bridge.land_detector import Landed
 from trueflight.sim_bridge.mavlink import wire
 from trueflight.sim_bridge.mavlink.esc_status import ESC_STATUS, EscStatus
 from trueflight.sim_bridge.modes import Mode

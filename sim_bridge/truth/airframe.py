@@ -164,11 +164,34 @@ class Airframe:
         m.v = r01 * ax + r11 * ay + r21 * az
         m.w = r02 * ax + r12 * ay + r22 * az
 
+        self._turn_rotors(commands)
+        if self.on_rotors:
+            for act in self.on_rotors:
+                act(m)
+        t0, t1, t2, t3 = m.thrusts
+        (x0, y0, c0), (x1, y1, c1), (x2, y2, c2), (x3, y3, c3) = self._arms
+        body = m.wrench
+        body[0] = body[1] = 0.0
+        body[2] = t0 + t1 + t2 + t3
+        body[3] = y0 * t0 + y1 * t1 + y2 * t2 + y3 * t3
+        body[4] = -(x0 * t0 + x1 * t1 + x2 * t2 + x3 * t3)
+        # A rotor that turns counter-clockwise is braked clockwise by the air, and so is the body that holds
+        # it.
+        body[5] = -(c0 * t0 + c1 * t1 + c2 * t2 + c3 * t3)
+        for act in self.on_body:
+            act(m)
+        fx, fy, fz, wrench[3], wrench[4], wrench[5] = body
+        wrench[0] = r00 * fx + r01 * fy + r02 * fz
+        wrench[1] = r10 * fx + r11 * fy + r12 * fz
+        wrench[2] = r20 * fx + r21 * fy + r22 * fz
+
+    def _turn_rotors(self, commands: list[float]) -> None:
+        """Advance rotors and battery by one step: speeds, thrusts and voltage of `motion`."""
         train = self.powertrain
         constants = train.thrust_constants
         hover_speed, hover_command, blend = train.hover_speed, train.hover_command, train.speed_blend
         linear, follow = train.linear, self._follow
-        speeds, thrusts = m.speeds, m.thrusts
+        speeds, thrusts = self.motion.speeds, self.motion.thrusts
         power = 0.0
         for i in (0, 1, 2, 3):
             ratio = commands[i] / hover_command
@@ -185,27 +208,7 @@ class Airframe:
             middle = before + 0.5 * change
             thrusts[i] = thrust = constants[i] * middle * middle
             power += thrust * middle
-        m.voltage = self.battery.load(power * self._power_per_speed + _AVIONICS_POWER)
+        self.motion.voltage = self.battery.load(power * self._power_per_speed + _AVIONICS_POWER)
         self._steps += 1
         if self._steps % _DISCHARGE_STEPS == 0:
             self.battery.discharge(_DISCHARGE_STEPS * self.dt)
-
-        if self.on_rotors:
-            for act in self.on_rotors:
-                act(m)
-        t0, t1, t2, t3 = thrusts
-        (x0, y0, c0), (x1, y1, c1), (x2, y2, c2), (x3, y3, c3) = self._arms
-        body = m.wrench
-        body[0] = body[1] = 0.0
-        body[2] = t0 + t1 + t2 + t3
-        body[3] = y0 * t0 + y1 * t1 + y2 * t2 + y3 * t3
-        body[4] = -(x0 * t0 + x1 * t1 + x2 * t2 + x3 * t3)
-        # A rotor that turns counter-clockwise is braked clockwise by the air, and so is the body that holds
-        # it.
-        body[5] = -(c0 * t0 + c1 * t1 + c2 * t2 + c3 * t3)
-        for act in self.on_body:
-            act(m)
-        fx, fy, fz, wrench[3], wrench[4], wrench[5] = body
-        wrench[0] = r00 * fx + r01 * fy + r02 * fz
-        wrench[1] = r10 * fx + r11 * fy + r12 * fz
-        wrench[2] = r20 * fx + r21 * fy + r22 * fz

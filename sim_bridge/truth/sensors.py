@@ -92,28 +92,16 @@ class Sensors:
             # Drawn in blocks: one call for a thousand samples costs less than one call for each number.
             self._rows = self._generator.standard_normal((_BLOCK, _DRAWS)).tolist()
         n = self._rows.pop()
-        noise = self.noise
-        wander = self._wander
-        elapsed = time_us - self._last_us
+        noise, wander = self.noise, self._wander
         # The autopilot's own sample may be newer than the one that a companion is told next.
-        if elapsed > 0:
-            self._last_us = time_us
-            decay = math.exp(elapsed * -1e-6 / noise.wander_time)
-            kick = math.sqrt(1.0 - decay * decay)
-            for i in range(9):
-                wander[i] = decay * wander[i] + kick * n[i]
-        x, y, z, qw, qx, qy, qz = position
+        if time_us > self._last_us:
+            self._let_wander(time_us, n)
+        x, y, z, *quaternion = position
         vx, vy, vz, p, q, r = velocity
         sp, sw = noise.position, noise.position_wander
         vp, vw = noise.velocity, noise.velocity_wander
         ap, aw = 0.5 * noise.attitude, 0.5 * noise.attitude_wander
-        # A small rotation in the world, then normalised: (1, e) times the true quaternion.
         ex, ey, ez = ap * n[15] + aw * wander[6], ap * n[16] + aw * wander[7], ap * n[17] + aw * wander[8]
-        ew = qw - ex * qx - ey * qy - ez * qz
-        fx = qx + ex * qw + ey * qz - ez * qy
-        fy = qy + ey * qw + ez * qx - ex * qz
-        fz = qz + ez * qw + ex * qy - ey * qx
-        scale = 1.0 / math.sqrt(ew * ew + fx * fx + fy * fy + fz * fz)
         ax, ay, az = acceleration
         az += GRAVITY
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
@@ -131,7 +119,7 @@ class Sensors:
                 vy + vp * n[13] + vw * wander[4],
                 vz + vp * n[14] + vw * wander[5],
             ),
-            (scale * ew, scale * fx, scale * fy, scale * fz),
+            _turned(quaternion, ex, ey, ez),
             (p + sg * n[18], q + sg * n[19], r + sg * n[20]),
             (
                 r00 * ax + r10 * ay + r20 * az + bx + sa * n[21],
@@ -141,3 +129,21 @@ class Sensors:
             voltage + noise.voltage * n[24],
             (speeds[0], speeds[1], speeds[2], speeds[3]),
         )
+
+    def _let_wander(self, time_us: int, n: list[float]) -> None:
+        """Move the slow errors on from the last time to this one."""
+        decay = math.exp((time_us - self._last_us) * -1e-6 / self.noise.wander_time)
+        kick = math.sqrt(1.0 - decay * decay)
+        self._wander[:] = [decay * old + kick * new for old, new in zip(self._wander, n, strict=False)]
+        self._last_us = time_us
+
+
+def _turned(quaternion: list[float], ex: float, ey: float, ez: float) -> tuple[float, float, float, float]:
+    """A small rotation in the world, then normalised: (1, e) times the true quaternion."""
+    qw, qx, qy, qz = quaternion
+    w = qw - ex * qx - ey * qy - ez * qz
+    x = qx + ex * qw + ey * qz - ez * qy
+    y = qy + ey * qw + ez * qx - ex * qz
+    z = qz + ez * qw + ex * qy - ey * qx
+    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return scale * w, scale * x, scale * y, scale * z

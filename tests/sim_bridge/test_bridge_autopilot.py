@@ -7,7 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from trueflight.models.vehicle import Vehicle
-from trueflight.sim_bridge.autopilot import Autopilot, Landed, Verdict
+from trueflight.sim_bridge.autopilot import Autopilot, Verdict
+from trueflight.sim_bridge.land_detector import Landed
 from trueflight.sim_bridge.mavlink.server import pilot_order
 from trueflight.sim_bridge.modes import Mode
 from trueflight.sim_bridge.parameters import Parameters
