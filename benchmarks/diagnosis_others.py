@@ -43,7 +43,8 @@ from trueflight.models.flight import Flight
 from trueflight.models.model import rigid_body_model
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import load_vehicle
-from trueflight.sim_bridge.in_process import Plan, record
+from trueflight.sim_bridge.in_process import record
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.truth.hidden import choose
 from trueflight.sim_bridge.truth.sensors import Noise
 

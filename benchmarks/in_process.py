@@ -23,7 +23,8 @@ import mujoco
 from trueflight.models.design import load_design
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import load_vehicle
-from trueflight.sim_bridge.in_process import Plan, fly, record
+from trueflight.sim_bridge.in_process import fly, record
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.simulator import Simulator
 from trueflight.sim_bridge.truth.effects import EFFECTS
 from trueflight.sim_bridge.truth.hidden import choose

@@ -10,13 +10,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from trueflight.models.database import Collection, Sortie, record_name
+from trueflight.models.database import Collection, Sortie, database, record_name
 from trueflight.models.design import design_to_json
 from trueflight.models.errors import InputError
 from trueflight.models.record import vehicle_to_toml
+from trueflight.models.vehicle import Vehicle
 from trueflight.models.workers import interrupts_held, worker_pool
-from trueflight.sim_bridge.in_process import Flown, Plan, record
+from trueflight.sim_bridge.in_process import Flown, record
+from trueflight.sim_bridge.plan import Plan, design_of
+from trueflight.sim_bridge.settings import Settings
 from trueflight.sim_bridge.truth.battery import BatteryState
+from trueflight.sim_bridge.truth.hidden import Hidden, choose
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,58 @@ class Flight:
     def name(self) -> str:
         """File name of its record."""
         return record_name(self.number, self.sortie)
+
+
+@dataclass(frozen=True)
+class Database:
+    """A training database under way: its flights, what is hidden in all of them, and the folder that they fly into."""
+
+    flights: list[Flight]
+    hidden: tuple[Hidden, ...]
+    collection: Collection
+
+    @property
+    def seconds(self) -> float:
+        """Flight time of the whole, s."""
+        return sum(flight.sortie.path.duration for flight in self.flights)
+
+    @property
+    def flown_seconds(self) -> float:
+        """Flight time that the folder has already, s."""
+        return sum(entry["seconds"] for entry in self.collection.flown.values())
+
+    def entries(self) -> list[dict[str, Any]]:
+        """What is known of each flight, once all have flown."""
+        return [self.collection.flown[flight.name] for flight in self.flights]
+
+    def fly(self, jobs: int) -> Iterator[tuple[Flight, dict[str, Any]]]:
+        """Fly what is missing, as `collect` does."""
+        return collect(self.flights, self.collection, jobs)
+
+
+def begin(
+    folder: Path, settings: Settings, vehicle: Vehicle, minutes: float, rate: float, model: bytes | None
+) -> Database:
+    """Begin a database of at least so many minutes in a folder, or continue it. Raises `InputError`, and writes nothing
+    then, for what cannot be flown and for a folder that holds something else.
+    """
+    sorties = database(settings.seed, minutes)
+    plan = Plan(
+        vehicle,
+        design_of(settings, vehicle),
+        sorties[0].path,
+        choose(list(settings.hidden), vehicle, settings.seed, settings.hidden_count),
+        settings.seed,
+        rate=rate,
+        model=model,
+        noise=settings.sensor_noise,
+        battery=settings.battery,
+    )
+    _ = plan.steps_per_tick  # a rate that cannot be flown is told before anything is written
+    asked = {"hidden": settings.hidden, "seed": settings.seed, "minutes": minutes, "rate": rate}
+    asked |= {"noise": settings.noise, "battery_age": settings.battery_age, "fingerprint": fingerprint(plan)}
+    collection = Collection(folder, {"flown_by": "sim-bridge collect", "vehicle": vehicle.name, **asked})
+    return Database(flights(sorties, plan), plan.hidden, collection)
 
 
 def flights(sorties: Sequence[Sortie], plan: Plan) -> list[Flight]:

@@ -9,77 +9,29 @@ import csv
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from trueflight.companion.law.control import ControlLaw, ControlStep, State
-from trueflight.companion.law.controllers import Preview, TrimLimits, make_controller
+from trueflight.companion.law.controllers import Preview, make_controller
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.inference import check_model
-from trueflight.models.contract import CORRECTED, LQR
-from trueflight.models.design import Design
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS
 from trueflight.models.record import FlightRecorder
 from trueflight.models.record_pb2 import Event, Tick
 from trueflight.models.trajectory import ReferenceSample, Trajectory, transfer
-from trueflight.models.vehicle import Vehicle
 from trueflight.models.whole_file import whole_file
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.simulator import Simulator
-from trueflight.sim_bridge.truth.battery import FULL, BatteryState
-from trueflight.sim_bridge.truth.hidden import Hidden
-from trueflight.sim_bridge.truth.sensors import Estimate, Noise
+from trueflight.sim_bridge.truth.sensors import Estimate
 from trueflight.sim_bridge.world import PHYSICS_STEP
 
 _LOST = 4.0  # m from the reference at which a flight is given up, as the companion does
 _BETWEEN_SPEED, _BETWEEN_ACCELERATION = 1.5, 2.0  # m/s, m/s²: from the end back to the start
 _TICK_EVENT_LEVELS = {"finished": "info", "lost": "error", "crashed": "error"}
-
-
-@dataclass(frozen=True)
-class Plan:
-    """One flight: who flies what, with what hidden. `rate` of the control law in Hz, `model` an ONNX file's
-    bytes.
-
-    `controller` is one of `companion.law.controllers.CONTROLLERS`; `corrected` needs a `model`, the others take none.
-    Where it is empty the vehicle flies `corrected` with a model and `lqr` without. For `settle` s the vehicle holds
-    the start before the trajectory begins, as the companion does: a correction has faded in by then. The record has
-    `rotor_speeds` where the vehicle's speed controllers report them.
-    """
-
-    vehicle: Vehicle
-    design: Design
-    trajectory: Trajectory
-    hidden: tuple[Hidden, ...] = ()
-    seed: int = 0
-    repeat: int = 1
-    rate: float = 100.0
-    model: bytes | None = None
-    noise: Noise | None = None
-    battery: BatteryState = FULL
-    controller: str = ""
-    settle: float = 0.0
-    trim: TrimLimits = field(default_factory=TrimLimits)
-    rotor_speeds: bool = True
-
-    def __post_init__(self) -> None:
-        if not self.controller:
-            object.__setattr__(self, "controller", LQR if self.model is None else CORRECTED)
-        if (self.model is None) != (self.controller != CORRECTED):
-            raise InputError("--controller corrected needs --model, and no other controller takes one")
-
-    @property
-    def steps_per_tick(self) -> int:
-        """Physics steps between two control ticks. Raises `InputError` where the rates do not divide."""
-        steps = 1.0 / (self.rate * PHYSICS_STEP)
-        if not math.isclose(steps, round(steps), rel_tol=1e-9) or round(steps) < 1:
-            physics = round(1 / PHYSICS_STEP)
-            raise InputError(
-                f"--rate {self.rate:g}: must divide the physics rate of {physics} Hz (50, 100, 250, 500)"
-            )
-        return round(steps)
 
 
 class Sample(NamedTuple):
@@ -124,14 +76,10 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     the reference of the moment that it tells of. Raises `InputError` for a design or a model that belongs to another
     vehicle.
     """
-    vehicle = plan.vehicle
-    law = ControlLaw(vehicle, plan.design)
     guard, steps = _guard(plan), plan.steps_per_tick
-    controller = make_controller(plan.controller, law, guard, plan.trim)
-    simulator = Simulator(vehicle, plan.hidden, plan.seed, plan.noise, plan.battery)
+    controller = make_controller(plan.controller, ControlLaw(plan.vehicle, plan.design), guard, plan.trim)
+    simulator = _in_hover(plan)
     ground = simulator.world.standing_height
-    x, y, z, yaw = plan.trajectory.start
-    simulator.start_in_hover((x, y, z + ground), yaw)
     period = steps * PHYSICS_STEP
     squares = [0.0, 0.0, 0.0]
     ticks, touching, outcome = 0, 0, "finished"
@@ -149,15 +97,7 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
         now = reported()
         px, py, pz = now.position
         position = (px, py, pz - ground)
-        state = State(
-            position,
-            now.velocity,
-            now.quaternion,
-            position[2],
-            now.battery_voltage,
-            now.angular_velocity,
-            now.specific_force,
-        )
+        state = _state(now, position)
         control = controller.step(state, preview, period if ticks else 0.0)
         if guard is not None:
             status, inference = guard.status, guard.inference_time
@@ -185,6 +125,26 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     wall = time.perf_counter() - begin
     a, b, c = (math.sqrt(total / ticks) for total in squares)
     return Flown(outcome, ticks, ticks * period, wall, (a, b, c), status, touching)
+
+
+def _in_hover(plan: Plan) -> Simulator:
+    simulator = Simulator(plan.vehicle, plan.hidden, plan.seed, plan.noise, plan.battery)
+    x, y, z, yaw = plan.trajectory.start
+    simulator.start_in_hover((x, y, z + simulator.world.standing_height), yaw)
+    return simulator
+
+
+def _state(now: Estimate, position: tuple[float, float, float]) -> State:
+    """What the control law takes of an estimate, with the position in the home frame."""
+    return State(
+        position,
+        now.velocity,
+        now.quaternion,
+        position[2],
+        now.battery_voltage,
+        now.angular_velocity,
+        now.specific_force,
+    )
 
 
 def _guard(plan: Plan) -> Guard | None:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from trueflight.models.errors import InputError
 from trueflight.models.whole_file import write_whole
+from trueflight.sim_bridge.settings import Settings
 from trueflight.sim_bridge.truth.hidden import Hidden
 
 _HEADER = "trueflight sealed answer 1: open it with `sim-bridge reveal`"
@@ -31,6 +32,27 @@ def seal(hidden: tuple[Hidden, ...], vehicle: str, seed: int, path: Path) -> Non
     masked = hashlib.sha256(packed).digest() + _mask(packed)
     text = _HEADER + "\n" + base64.b85encode(masked).decode() + "\n"
     write_whole(path, text, "the sealed answer", "choose --sealed FILE")
+
+
+def seal_where_asked(
+    settings: Settings, hidden: tuple[Hidden, ...], vehicle: str, default: Path
+) -> Path | None:
+    """Seal the answer and return where; None where nobody asked for a seal and the user knows what is hidden.
+
+    To be called last of all, when nothing else can fail: the answer to an earlier flight must not be lost to a mistyped
+    one.
+    """
+    if not settings.sealed and not {"random", "any", "rich"} & set(settings.hidden):
+        return None
+    path = Path(settings.sealed) if settings.sealed else default
+    seal(hidden, vehicle, settings.seed, path)
+    return path
+
+
+def hidden_text(settings: Settings, sealed: Path | None) -> str:
+    """What is hidden, as asked for, and where its answer is."""
+    names = ", ".join(settings.hidden)
+    return f"hidden: {names}" + (f" (the answer is sealed in {sealed})" if sealed else "")
 
 
 def reveal(path: Path) -> dict[str, object]:

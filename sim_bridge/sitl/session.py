@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import sys
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-import typer
-from rich.console import Console
-from rich.table import Table
 
 from trueflight.models.errors import InputError
 from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.seal import hidden_text, seal_where_asked
 from trueflight.sim_bridge.settings import Settings
 from trueflight.sim_bridge.simulator import Simulator
 from trueflight.sim_bridge.sitl.allocation import expected_parameters
@@ -74,17 +68,6 @@ def check_hidden(hidden: tuple[Hidden, ...]) -> None:
             )
 
 
-def parameter_table(vehicle: Vehicle, values: dict[str, int | float] | None = None) -> Table:
-    """What PX4's control allocation must be for a vehicle, beside what PX4 has."""
-    table = Table()
-    for column in ("parameter", "vehicle file", *(("PX4",) if values is not None else ()), "what"):
-        table.add_column(column, justify="left" if column in ("parameter", "what") else "right", no_wrap=True)
-    for one in expected_parameters(vehicle):
-        has = () if values is None else (f"{values[one.name]:.4g}" if one.name in values else "not told",)
-        table.add_row(one.name, f"{one.value:.4g}", *has, one.what)
-    return table
-
-
 def parameter_lines(vehicle: Vehicle, position: Position) -> list[str]:
     """The commands of PX4's shell (or lines of its `px4-rc.params`) that make its control allocation the vehicle's."""
     lines = [f"param set {one.name} {one.value:.6g}" for one in expected_parameters(vehicle)]
@@ -100,47 +83,20 @@ def estimator_parameters(position: Position) -> dict[str, int]:
     return VISION_ESTIMATOR if position is Position.BOTH else {**VISION_ESTIMATOR, **NO_GPS}
 
 
-class Teller:
-    """Tells a user what happens: lines on standard output (JSON objects where asked), a live line on a terminal."""
-
-    def __init__(self, as_json: bool) -> None:
-        self._as_json = as_json
-        self._status: Any = None
-        self._told = 0.0
-        if not as_json and sys.stderr.isatty():
-            self._status = Console(stderr=True).status("")
-
-    def __enter__(self) -> Teller:
-        if self._status is not None:
-            self._status.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._status is not None:
-            self._status.stop()
+class Teller(Protocol):
+    """Whoever is told what happens."""
 
     def tell(self, event: str, text: str, **more: Any) -> None:
         """One thing that happened."""
-        typer.echo(json.dumps({"event": event, "text": text, **more}) if self._as_json else text)
-        sys.stdout.flush()
 
     def note(self, text: str) -> None:
         """A remark."""
-        self.tell("note", text)
-
-    def show(self, table: Table) -> None:
-        """A table, for people."""
-        if not self._as_json:
-            Console(width=100).print(table)
 
     def live(self, text: str) -> None:
-        """What is going on, on a terminal's last line, twice a second."""
-        now = time.monotonic()
-        if self._status is not None and now - self._told > 0.5:
-            self._told = now
-            self._status.update(text)
+        """What is going on just now."""
+
+    def differences(self, vehicle: Vehicle, values: dict[str, int | float]) -> None:
+        """What PX4 has (`values`) where its control allocation is another vehicle's."""
 
 
 def fly(
@@ -148,15 +104,13 @@ def fly(
     hidden: tuple[Hidden, ...],
     settings: Settings,
     request: Request,
-    seal: Callable[[], Path | None],
-    told: Callable[[Path | None], str],
     stopped: Callable[[], bool],
-    as_json: bool,
+    teller: Teller,
 ) -> None:
     """Simulate for one PX4 until it goes, or the user stops, or the duration is over.
 
-    `seal` writes the sealed answer once nothing can fail any more, `told` says what is hidden. Raises `InputError` for
-    what cannot be simulated, for another vehicle in PX4, and for a PX4 that vanishes in flight.
+    The answer is sealed once nothing can fail any more. Raises `InputError` for what cannot be simulated, for another
+    vehicle in PX4, and for a PX4 that vanishes in flight.
     """
     check_hidden(hidden)
     simulator = Simulator(vehicle, hidden, settings.seed, settings.sensor_noise, settings.battery)
@@ -164,35 +118,14 @@ def fly(
     sensors = RawSensors(RawNoise().times(settings.noise), settings.seed, raw.accelerometer_bias)
     offer = Offer(request.position, request.vision_rate, raw.delay)
     with ExitStack() as stack:
-        teller = stack.enter_context(Teller(as_json))
         lockstep = Lockstep(
             simulator, sensors, listen(request.host, request.port), teller.note, settings.speed, offer
         )
         stack.callback(lockstep.close)
-        check = None
-        if request.px4_port:
-            link = Px4Link(request.px4_port)
-            stack.callback(link.close)
-            check = AllocationCheck(
-                vehicle,
-                link,
-                simulator.airframe.battery,
-                request.set_params,
-                estimator_parameters(request.position),
-            )
+        check = _allocation_check(vehicle, simulator, request, stack)
         table = stack.enter_context(TruthTable(request.truth, simulator)) if request.truth else None
-        answer = seal()
-        pace = f"{settings.speed:g} times real time" if settings.speed else "as fast as it goes"
-        teller.tell(
-            "ready",
-            f"ready: {vehicle.name} waits for PX4 on TCP {request.host}:{request.port}, {pace}; {told(answer)}",
-            vehicle=vehicle.name,
-            port=request.port,
-            link_port=request.px4_port,
-            speed=settings.speed,
-            sealed=str(answer) if answer else None,
-        )
-        teller.live(f"waiting for PX4 on TCP port {request.port}")
+        answer = seal_where_asked(settings, hidden, vehicle.name, Path(f"hidden-seed-{settings.seed}.sealed"))
+        _tell_ready(vehicle, settings, request, answer, teller)
         if not lockstep.accept(lambda: not stopped()):
             teller.tell("stopped", "stopped; no PX4 came")
             return
@@ -203,6 +136,35 @@ def fly(
             lambda: not stopped() and lockstep.progress.simulated * 1e6 < end_us, watch.each_step
         )
         _conclude(ending, lockstep.progress, check, teller)
+
+
+def _allocation_check(
+    vehicle: Vehicle, simulator: Simulator, request: Request, stack: ExitStack
+) -> AllocationCheck | None:
+    """What compares PX4's control allocation with the vehicle; None where the request has no port for it."""
+    if not request.px4_port:
+        return None
+    link = Px4Link(request.px4_port)
+    stack.callback(link.close)
+    wished = estimator_parameters(request.position)
+    return AllocationCheck(vehicle, link, simulator.airframe.battery, request.set_params, wished)
+
+
+def _tell_ready(
+    vehicle: Vehicle, settings: Settings, request: Request, answer: Path | None, teller: Teller
+) -> None:
+    pace = f"{settings.speed:g} times real time" if settings.speed else "as fast as it goes"
+    address, hidden = f"TCP {request.host}:{request.port}", hidden_text(settings, answer)
+    teller.tell(
+        "ready",
+        f"ready: {vehicle.name} waits for PX4 on {address}, {pace}; {hidden}",
+        vehicle=vehicle.name,
+        port=request.port,
+        link_port=request.px4_port,
+        speed=settings.speed,
+        sealed=str(answer) if answer else None,
+    )
+    teller.live(f"waiting for PX4 on TCP port {request.port}")
 
 
 class _Watch:
@@ -241,12 +203,8 @@ class _Watch:
         try:
             check.step(time_us)
         except InputError:
-            self._teller.show(
-                parameter_table(
-                    self._vehicle,
-                    {one.name: value for one, value in check.rows() if value is not None},
-                )
-            )
+            has = {one.name: value for one, value in check.rows() if value is not None}
+            self._teller.differences(self._vehicle, has)
             raise
         if check.state is State.WAITING or self._told_check:
             return

@@ -15,7 +15,8 @@ from trueflight.models import frames
 from trueflight.models.design import load_design
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import load_vehicle
-from trueflight.sim_bridge.in_process import Plan, Sample, fly
+from trueflight.sim_bridge.in_process import Sample, fly
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.truth.hidden import choose
 
 QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5"

@@ -42,7 +42,8 @@ from trueflight.models.record import read_record
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import load_vehicle
 from trueflight.models.whole_file import write_whole
-from trueflight.sim_bridge.in_process import Plan, record
+from trueflight.sim_bridge.in_process import record
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.seal import reveal, seal
 
 

@@ -27,7 +27,8 @@ from trueflight.models.model import Term, rigid_body_model
 from trueflight.models.prediction import apply_effects, motion_of_flight, specific_force
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import GRAVITY, Vehicle, load_vehicle
-from trueflight.sim_bridge.in_process import Plan, record
+from trueflight.sim_bridge.in_process import record
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.truth.effects import EFFECTS
 from trueflight.sim_bridge.truth.hidden import Hidden, choose
 

@@ -22,7 +22,8 @@ from trueflight.models.design import load_design
 from trueflight.models.errors import InputError, run_command_line
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import load_vehicle
-from trueflight.sim_bridge.in_process import Plan, record
+from trueflight.sim_bridge.in_process import record
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.truth.hidden import choose
 from trueflight.sim_bridge.truth.sensors import Noise
 

@@ -18,7 +18,7 @@ from trueflight.models.record import read_record
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import Vehicle
 from trueflight.sim_bridge.collect import fingerprint, flights
-from trueflight.sim_bridge.in_process import Plan
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.seal import reveal
 from trueflight.sim_bridge.truth.hidden import choose
 

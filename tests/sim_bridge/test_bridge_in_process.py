@@ -14,7 +14,8 @@ from trueflight.models.errors import InputError
 from trueflight.models.record import read_record
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import GRAVITY, Vehicle
-from trueflight.sim_bridge.in_process import Plan, Sample, fly, record
+from trueflight.sim_bridge.in_process import Sample, fly, record
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.truth.hidden import choose
 from trueflight.sim_bridge.truth.sensors import NO_NOISE, Noise
 

@@ -15,9 +15,10 @@ from trueflight.models.errors import InputError
 from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import GRAVITY, Vehicle
 from trueflight.sim_bridge.autopilot import Autopilot
-from trueflight.sim_bridge.in_process import Plan, Sample, fly, record
+from trueflight.sim_bridge.in_process import Sample, fly, record
 from trueflight.sim_bridge.mavlink.telemetry import STREAMS
 from trueflight.sim_bridge.parameters import Parameters
+from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.seal import reveal, seal
 from trueflight.sim_bridge.simulator import Simulator
 from trueflight.sim_bridge.truth.airframe import believed_powertrain
