@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
@@ -16,6 +15,7 @@ import typer
 
 from trueflight.companion import onboard_commands
 from trueflight.models.errors import run_command_line
+from trueflight.models.printed import print_json_line
 
 app = typer.Typer(
     name="companion",
@@ -188,7 +188,7 @@ def check(
     finally:
         link.close()
     if as_json:
-        typer.echo(json.dumps(report))
+        print_json_line(report)
         return
     table = Table("", "", show_header=False)
     for key, value in report.items():
@@ -217,7 +217,7 @@ def trajectories(as_json: Json = False) -> None:
             }
             for name, kind in KINDS.items()
         }
-        typer.echo(json.dumps(listing))
+        print_json_line(listing)
         return
     table = Table("trajectory", "what it does", "parameters")
     for name, kind in KINDS.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,6 +14,7 @@ from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn
 
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json_line
 
 if TYPE_CHECKING:
     from trueflight.companion.pose import PoseFeed
@@ -92,7 +92,7 @@ def preflight_command(
     finally:
         link.close()
     if as_json:
-        typer.echo(json.dumps({**preflight.as_json(report), "changed": changed}))
+        print_json_line({**preflight.as_json(report), "changed": changed})
     else:
         console.print(f"{report.autopilot} on {escape(settings.connect)}")
         console.print(table_of("Arming", report.arming, "what to do"))
@@ -133,7 +133,7 @@ def doctor_command(
         findings = doctor.examine(settings, root, tell)
     failed = [finding for finding in findings if finding.state == FAIL]
     if as_json:
-        typer.echo(json.dumps({"ready": not failed, "findings": rows_of(findings)}))
+        print_json_line({"ready": not failed, "findings": rows_of(findings)})
     else:
         console.print(table_of("This machine", findings, "what to do"))
         told = (
@@ -182,7 +182,7 @@ def install_command(
     done = install(service, output, dry_run)
     if as_json:
         files = {str(path): state for path, state in done}
-        typer.echo(json.dumps({"files": files, "next": list(next_steps(service)), "dry_run": dry_run}))
+        print_json_line({"files": files, "next": list(next_steps(service)), "dry_run": dry_run})
         return
     if dry_run:
         for name, text in texts(service).items():

@@ -24,8 +24,9 @@ from trueflight.groundstation.commands.options import (
     ValidateOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import print_json, print_written
+from trueflight.groundstation.output.terminal import print_written
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json
 from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from trueflight.groundstation.commands.options import DesignOption, JsonOption, SaveOption, VehicleOption
-from trueflight.groundstation.output.terminal import print_json
+from trueflight.models.printed import print_json
 
 if TYPE_CHECKING:
     from trueflight.groundstation.evaluate.bound import Tube

@@ -12,8 +12,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from trueflight.groundstation.commands.options import QUAD5, JsonOption
-from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json
 
 if TYPE_CHECKING:
     from trueflight.groundstation.evaluate.calibration import Calibration, Case, Proportion

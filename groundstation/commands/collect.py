@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +26,7 @@ from trueflight.groundstation.commands.options import (
 )
 from trueflight.groundstation.commands.pilot import check_controller, link_settings, warn
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json_line
 
 if TYPE_CHECKING:
     from trueflight.groundstation.operate.link import Link
@@ -85,7 +85,7 @@ def collect_command(
     seconds = sum(entry["seconds"] for entry in collection.flown.values())
     if as_json:
         report = {"folder": str(output), "wanted": len(sorties), "seconds": seconds, "reason": reason}
-        typer.echo(json.dumps({**report, "flights": collection.flown}))
+        print_json_line({**report, "flights": collection.flown})
     else:
         _print_collected(collection.flown)
     told = f"{output}: {len(collection.flown)} of {len(sorties)} flights, {seconds / 60:.1f} min"

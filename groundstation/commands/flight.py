@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -23,6 +22,7 @@ from trueflight.groundstation.commands.options import (
 )
 from trueflight.models.errors import InputError
 from trueflight.models.outside import toml_table
+from trueflight.models.printed import print_json
 
 if TYPE_CHECKING:
     from trueflight.groundstation.design.linear_design import Loop
@@ -70,7 +70,7 @@ def flights_command(
     )
     rows = [_flight_row(file, directory) for file in shown]
     if as_json:
-        typer.echo(json.dumps(rows, indent=1))
+        print_json(rows)
         return
     from rich.table import Table
 
@@ -224,7 +224,7 @@ def import_command(
             "to_complete": list(drafted.to_complete),
         }
     if as_json:
-        typer.echo(json.dumps(told, indent=1))
+        print_json(told)
         return
     if drafted is not None and draft is not None:
         _print_draft(drafted, draft, file)
@@ -311,28 +311,25 @@ def design_command(
     save_design(design, target)
     found, integral = loops(design, believed), integral_loops(design, believed)
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    "design": str(target),
-                    "K_zeta": design.K_zeta,
-                    "K_eta": design.K_eta,
-                    "integral": None if design.integral is None else asdict(design.integral),
-                    "loops": [_loop_row(loop) for loop in found],
-                    "integral_loops": [
-                        {
-                            **_loop_row(i.loop),
-                            "disturbance_removed_after": i.removal,
-                            "disturbance_allowed": i.allowed,
-                            "disturbance_peak": i.peak,
-                            "step_distance_to_lqr": i.step_distance,
-                            "translation_distance_to_lqr": i.translation_distance,
-                        }
-                        for i in integral
-                    ],
-                },
-                indent=1,
-            )
+        print_json(
+            {
+                "design": str(target),
+                "K_zeta": design.K_zeta,
+                "K_eta": design.K_eta,
+                "integral": None if design.integral is None else asdict(design.integral),
+                "loops": [_loop_row(loop) for loop in found],
+                "integral_loops": [
+                    {
+                        **_loop_row(i.loop),
+                        "disturbance_removed_after": i.removal,
+                        "disturbance_allowed": i.allowed,
+                        "disturbance_peak": i.peak,
+                        "step_distance_to_lqr": i.step_distance,
+                        "translation_distance_to_lqr": i.translation_distance,
+                    }
+                    for i in integral
+                ],
+            },
         )
         return
     from rich.table import Table
@@ -418,7 +415,7 @@ def track_command(
 
         write_tracking(rrd, tracked)
     if as_json:
-        typer.echo(json.dumps([_tracking_row(t, tracked[0]) for t in tracked], indent=1))
+        print_json([_tracking_row(t, tracked[0]) for t in tracked])
         return
     from rich.table import Table
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from trueflight.models.access import ENGINEER, OBSERVER, OPERATOR
+from trueflight.models.printed import print_json_line
 
 console = Console()
 
@@ -55,18 +55,16 @@ def keys_command(
     made = make_keys(folder, vehicle or [], people, remove or [], days)
     steps = next_steps(made)
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    "made": [str(path) for path in made.made],
-                    "changed": [str(path) for path in made.changed],
-                    "removed": list(made.removed),
-                    "authority": str(folder / "ca"),
-                    "new_authority": made.new_authority,
-                    "until": made.until.isoformat(timespec="seconds"),
-                    "next": steps,
-                }
-            )
+        print_json_line(
+            {
+                "made": [str(path) for path in made.made],
+                "changed": [str(path) for path in made.changed],
+                "removed": list(made.removed),
+                "authority": str(folder / "ca"),
+                "new_authority": made.new_authority,
+                "until": made.until.isoformat(timespec="seconds"),
+                "next": steps,
+            }
         )
         return
     if made.new_authority:

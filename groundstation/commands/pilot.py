@@ -28,6 +28,7 @@ from trueflight.groundstation.commands.options import (
 )
 from trueflight.models.contract import CONTROLLERS, too_large
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json, print_json_line
 
 if TYPE_CHECKING:
     from trueflight.groundstation.operate.link import Link
@@ -140,7 +141,7 @@ def fly_command(
         answer = link.request("mission", mission)
         if not wait:
             if as_json:
-                typer.echo(json.dumps(answer))
+                print_json_line(answer)
             else:
                 console.print(
                     f"accepted as {answer['mission']}, {answer['duration']:.0f} s ({answer['reason']})"
@@ -157,7 +158,7 @@ def fly_command(
             "record": record,
         }
     if as_json:
-        typer.echo(json.dumps(result))
+        print_json_line(result)
     elif ended["state"] == "finished":
         console.print(f"flown: {escape(record)}")
     if ended["state"] != "finished":
@@ -204,14 +205,11 @@ def _list_trajectories(as_json: bool) -> None:
     from trueflight.models.reference import KINDS
 
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    k.name: {"text": k.text, "parameters": {p.name: p.default for p in k.parameters}}
-                    for k in KINDS.values()
-                },
-                indent=1,
-            )
+        print_json(
+            {
+                k.name: {"text": k.text, "parameters": {p.name: p.default for p in k.parameters}}
+                for k in KINDS.values()
+            }
         )
         return
     from rich.table import Table
@@ -333,7 +331,7 @@ def deploy_command(
             if wait and result.get("state") == "shadow":
                 result |= _follow_candidate(link, result["hash"], events, as_json)
     if as_json:
-        typer.echo(json.dumps(result))
+        print_json_line(result)
         return
     if roll_back:
         console.print(escape(f"'{vehicle}': {result['reason']}"), highlight=False)
@@ -463,7 +461,7 @@ def status_command(
         records = link.records()
         warn(link)
     if as_json:
-        typer.echo(json.dumps({**status, "records": records}, indent=1))
+        print_json({**status, "records": records})
         return
     from rich.table import Table
 

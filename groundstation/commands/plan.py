@@ -19,8 +19,8 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json
 from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:

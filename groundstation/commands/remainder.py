@@ -20,8 +20,8 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json
 
 if TYPE_CHECKING:
     from trueflight.groundstation.results import Diagnosis, Unexplained

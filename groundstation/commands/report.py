@@ -22,7 +22,8 @@ from trueflight.groundstation.commands.options import (
     ValidateOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import print_json, print_written
+from trueflight.groundstation.output.terminal import print_written
+from trueflight.models.printed import print_json
 
 console = Console()
 

@@ -16,9 +16,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from trueflight.groundstation.commands.options import QUAD5, JsonOption
-from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
 from trueflight.models.outside import read_text
+from trueflight.models.printed import print_json
 from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:

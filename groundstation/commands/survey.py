@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from trueflight.groundstation.commands.options import EffectsOption, JsonOption, MappingOption, VehicleOption
-from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json
 from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import print_json
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json
 
 if TYPE_CHECKING:
     from trueflight.groundstation.learn.ablation import Ablation

@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
-import typer
 from rich.console import Console
-
-
-def print_json(table: Any) -> None:
-    """One JSON document on standard output."""
-    typer.echo(json.dumps(table, indent=1, allow_nan=False))
 
 
 def print_written(console: Console, recording: Path | None, report: Path | None = None) -> None:

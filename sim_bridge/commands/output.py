@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 from collections.abc import Callable
@@ -10,10 +9,15 @@ from typing import Any
 
 import typer
 
+from trueflight.models.printed import print_json_line
+
 
 def tell(value: dict[str, Any], text: str, as_json: bool) -> None:
     """One answer on standard output."""
-    typer.echo(json.dumps(value) if as_json else text)
+    if as_json:
+        print_json_line(value)
+    else:
+        typer.echo(text)
 
 
 def until_interrupted() -> Callable[[], bool]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json_line
 from trueflight.models.vehicle import Vehicle, load_vehicle
 from trueflight.sim_bridge.commands.options import (
     DrawAndBattery,
@@ -99,7 +99,10 @@ class _Teller:
 
     def tell(self, event: str, text: str, **more: Any) -> None:
         """One thing that happened."""
-        typer.echo(json.dumps({"event": event, "text": text, **more}) if self._as_json else text)
+        if self._as_json:
+            print_json_line({"event": event, "text": text, **more})
+        else:
+            typer.echo(text)
         sys.stdout.flush()
 
     def note(self, text: str) -> None:
