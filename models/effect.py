@@ -13,11 +13,16 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
+import numpy as np
+
 from trueflight.models.flight import Flight
-from trueflight.models.vehicle import Vehicle
+from trueflight.models.vehicle import GRAVITY, Vehicle
 
 Array = Any
 """An array of any library that follows the Array API standard."""
+
+DESCENT, BELOW_CEILING = "descent", "below_ceiling"
+"""Flights that alone show some effects: a fast descent into one's own wake; close below something that hangs."""
 
 
 class Stage(IntEnum):
@@ -107,6 +112,9 @@ class Parameter:
     high: float
     structural: bool = False
     even: bool = False
+    clock_samples: float = 0.0
+    actuation: str = ""
+    truth: str = ""
 
     def neutral_for(self, vehicle: Vehicle) -> float:
         """The value at which the effect does nothing beyond what the vehicle file already says."""
@@ -127,6 +135,18 @@ class Effect:
     at most one of the parameters acts (the one rotor that is damaged): each is then a candidate on its own.
     `typical_for` gives sizes that depend on where the flight went (a ceiling just above its highest point) instead of
     the parameters' own; `starts_for` further values to begin a fit from, where one start may end in a wrong optimum.
+
+    The rest are parts that few effects play; an effect that leaves them out is treated as one that acts between the
+    rotors and the acceleration. `exact_rotation` is True for what turns thrust exactly: every diagnosis starts from
+    it. `shifts_clock` is True for a shift in time between command and measurement: a model without it is given one
+    within a sample, the error of a log's clock. Where rotor speeds are recorded, `before_rotors` effects are looked for
+    between command and rotors, with `scales_rotors` effects fitted beside them: no vehicle file tells what thrust a
+    rotor speed gives.
+
+    For studies of known truth: `shown_in` is the one kind of flight that shows it, `DESCENT` or `BELOW_CEILING`;
+    `truth_for` gives the true values of the parameters by the simulator's numbers and the neutral values, where a
+    parameter's own `truth` is not enough; `carrier_truth` is the simulator's number for every parameter of the first of
+    `acts_through`, where none of these is hidden with it.
     """
 
     name: str
@@ -149,6 +169,13 @@ class Effect:
     exclusive: bool = False
     typical_for: Callable[[Motion], Mapping[str, float]] | None = None
     starts_for: Callable[[Motion], Sequence[Mapping[str, float]]] | None = None
+    exact_rotation: bool = False
+    shifts_clock: bool = False
+    before_rotors: bool = False
+    scales_rotors: bool = False
+    shown_in: str = ""
+    truth_for: Callable[[Mapping[str, float], Mapping[str, float]], Mapping[str, float]] | None = None
+    carrier_truth: str = ""
 
     def apply(self, motion: Motion, values: Mapping[str, Any]) -> Motion:
         """The motion with this effect acting; `values` by parameter name."""
@@ -169,3 +196,57 @@ class Effect:
         """Parameter values of a size that matters, on this flight."""
         sizes = {p.name: p.typical for p in self.parameters}
         return sizes if self.typical_for is None else {**sizes, **self.typical_for(motion)}
+
+    def truth(self, hidden: Mapping[str, float], vehicle: Vehicle) -> dict[str, float]:
+        """True values of those parameters that have one, where the simulator hid the numbers `hidden`."""
+        if self.truth_for is not None:
+            return dict(self.truth_for(hidden, self.neutral(vehicle)))
+        return {p.name: hidden[p.truth] for p in self.parameters if p.truth}
+
+    @property
+    def undone_by_look_ahead(self) -> bool:
+        """Whether the controller undoes it by looking ahead, so that no correction has to."""
+        return any(p.actuation for p in self.parameters)
+
+    @property
+    def needs_yaw(self) -> bool:
+        """Whether the formula reads the heading in the world, as wind does; the formula itself is asked."""
+        heading = _any_motion()
+        return self._acts_on(heading) and not self._acts_on(heading.with_(cos_yaw=None, sin_yaw=None))
+
+    def _acts_on(self, motion: Motion) -> bool:
+        try:
+            self.apply(motion, {p.name: p.typical for p in self.parameters})
+        except Exception:  # noqa: BLE001 - a user's formula may fail in any way where something is None
+            return False
+        return True
+
+
+def _any_motion() -> Motion:
+    """Two samples of a hover with every column, for asking a formula what it reads."""
+    n = 2
+    vehicle = Vehicle(
+        "any", 1.0, 0.5, (0.01, 0.01, 0.02), 0.1, ((0.1, -0.1, 0.0), (-0.1, 0.1, 0.0)) * 2, (1, 1, -1, -1)
+    )
+    thrust, level, nothing = np.full(n, GRAVITY), np.zeros(n), np.zeros((n, 3))
+    return Motion(
+        vehicle=vehicle,
+        dt=0.01,
+        command=thrust,
+        thrust=thrust,
+        force=nothing,
+        reading=nothing,
+        thrust_acceleration=np.tile([0.0, 0.0, GRAVITY], (n, 1)),
+        rotation=np.tile(np.eye(3), (n, 1, 1)),
+        euler=(level, level),
+        air_velocity=np.ones((n, 3)),
+        cos_yaw=np.ones(n),
+        sin_yaw=level,
+        height=np.ones(n),
+        voltage=np.full(n, vehicle.nominal_voltage),
+        body_rate=nothing,
+        body_acceleration=nothing,
+        rotor_thrust=np.full((n, 4), 0.25 * vehicle.weight),
+        rotor_speed=np.full((n, 4), 1000.0),
+        torque=nothing,
+    )

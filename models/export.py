@@ -67,14 +67,11 @@ def sequential(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Sequ
     return torch.nn.Sequential(*modules)
 
 
-LOOKED_OVER = ("transport_delay", "motor_lag", "rate_loop_lag")
-"""Effects that the corrected controller undoes by looking ahead, not by the correction."""
-
-
 def not_exported(model: Model) -> tuple[str, ...]:
-    """Effects of the model that a vehicle cannot correct: other ones with memory, and errors of the sensor."""
+    """Effects of the model that a vehicle cannot correct: errors of the sensor, and effects with memory but those that
+    its controller undoes by looking ahead."""
     held = [e for e, _ in model.effect_chain() if not e.exports or e.stage is Stage.SENSOR]
-    return tuple(e.name for e in held if e.name not in LOOKED_OVER)
+    return tuple(e.name for e in held if not e.undone_by_look_ahead)
 
 
 def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] | None = None) -> bytes:
@@ -85,7 +82,7 @@ def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] |
 
     Raises `InputError` where a flight lacks position, velocity, attitude or command.
     """
-    names = feature_names(model.names())
+    names = feature_names(model)
     table = np.concatenate(
         [
             feature_matrix(features_of_flight(f, f.flying if f.flying is not None else slice(None)), names)

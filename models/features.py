@@ -10,13 +10,12 @@ from trueflight.models.contract import FEATURES, YAW_FEATURES
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.frames import euler_from_quaternion, heading_from_world
+from trueflight.models.model import Model
 
-NEEDS_YAW = ("wind",)
 
-
-def feature_names(effects: Sequence[str]) -> tuple[str, ...]:
-    """Names of the features of a model with these effects; yaw only where an effect needs it."""
-    yaw = YAW_FEATURES if any(e in NEEDS_YAW for e in effects) else {}
+def feature_names(model: Model) -> tuple[str, ...]:
+    """Names of the features of a model; yaw only where an effect needs it."""
+    yaw = YAW_FEATURES if any(effect.needs_yaw for effect, _ in model.effect_chain()) else {}
     return (*FEATURES, *yaw)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from trueflight.models.effect import Effect
-from trueflight.models.effects import catalogue, effect_named
+from trueflight.models.effects import EXACT_ROTATION, catalogue, effect_named
 from trueflight.models.errors import InputError
 from trueflight.models.network import Network, network_effect, network_from_table, network_table
 from trueflight.models.outside import is_number, json_object, read_text, shown
@@ -68,6 +68,11 @@ class Model:
         """Names of the effects in the model."""
         return tuple(t.effect for t in self.terms)
 
+    @property
+    def rotates_exactly(self) -> bool:
+        """Whether thrust is turned exactly, as a diagnosis needs it, instead of by the hover linearisation."""
+        return any(effect.exact_rotation for effect, _ in self.effect_chain())
+
     def with_terms(self, terms: tuple[Term, ...]) -> Model:
         """The model with other terms; a network stays as it is."""
         return replace(self, terms=terms)
@@ -92,7 +97,7 @@ def linear_model(vehicle: Vehicle) -> Model:
 
 def rigid_body_model(vehicle: Vehicle, effects_directory: str | None = None) -> Model:
     """The hover linearisation with exact rotation of thrust: where every diagnosis starts."""
-    return Model(vehicle=vehicle, terms=(Term("rigid_body", {}),), effects_directory=effects_directory)
+    return Model(vehicle=vehicle, terms=(Term(EXACT_ROTATION.name, {}),), effects_directory=effects_directory)
 
 
 def write_model(model: Model, path: Path) -> None:

@@ -61,6 +61,7 @@ EFFECT = Effect(
     citation="weight of the hanging length of a tether: mass per length times height times gravity",
     confounded_with=("thrust_gain", "ground_effect", "battery_sag"),
     # exports=False for an effect with memory: a correction on the vehicle is a static map of features.
+    # acts_through=("rotor_drag",) for one that acts only through another; docs/effects.md has the rest.
 )
 '''
 

@@ -268,6 +268,8 @@ def _print_training(done: Training, samples: Samples, base: Model) -> None:
     from rich.table import Table
 
     from trueflight.groundstation.learn.training import MATERIAL_MEMORY, memory_share
+    from trueflight.models.effect import Stage
+    from trueflight.models.effects import catalogue
 
     network, fit = done.network, done.network.fit
     minutes = samples.seconds / 60.0
@@ -305,9 +307,10 @@ def _print_training(done: Training, samples: Samples, base: Model) -> None:
         console.print(f"not used, for it did not vary in these flights: {', '.join(unused)}", style="yellow")
     share = memory_share(samples, done)
     if share > MATERIAL_MEMORY:
+        late = " or ".join(n for n, e in catalogue().items() if e.stage is Stage.COMMAND)
         console.print(
             f"{100 * share:.0f} % of what is left in z goes with the rate at which thrust changes: lag or delay are "
-            "not as believed, and a network has no memory. Add motor_lag or transport_delay first; "
+            f"not as believed, and a network has no memory. Add {late} first; "
             "'groundstation diagnose' tells which",
             style="yellow",
             highlight=False,

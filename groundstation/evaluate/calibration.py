@@ -7,10 +7,9 @@ Pure counting: what was hidden in each flight and what the diagnosis said of it 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -24,25 +23,6 @@ NOTHING = "nothing"
 SURE = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
 """Edges of the bins of the reliability diagram."""
 CALLED_SURE = 0.95
-
-TRUTH: dict[str, dict[str, str]] = {
-    "thrust_gain": {"gain": "gain"},
-    "battery_sag": {"exponent": "exponent"},
-    "motor_lag": {"tau": "time_constant"},
-    "transport_delay": {"delay": "extra_delay"},
-    "rotor_drag": {"x": "x", "y": "y"},
-    "parasitic_drag": {"x": "x", "y": "y", "z": "z"},
-    "translational_lift": {"lift": "lift"},
-    "wind": {"x": "east", "y": "north"},
-    "accelerometer_bias": {"x": "x", "y": "y", "z": "z"},
-    "imu_lever_arm": {"x": "x", "y": "y", "z": "z"},
-    "thrust_misalignment": {"x": "x", "y": "y"},
-    "com_offset": {"x": "x", "y": "y"},
-    "gyroscopic": {"inertia": "inertia"},
-}
-"""Parameters of the catalogue, and the simulator's number that is the truth of each. The laws of the others are not
-the simulator's (images of all rotors near the ground, a blend of rotor speeds, a raised cosine in descent), so that
-their parameters have no true value."""
 
 
 @dataclass(frozen=True)
@@ -459,79 +439,3 @@ def wrongs(case: Case) -> list[Wrong]:
     if not case.truth and case.unexplained:
         add("false alarm: unexplained structure")
     return out
-
-
-# --- from the files of a study --------------------------------------------------------------------------------------
-
-
-def case_from_table(flown: Mapping[str, Any], diagnosis: Mapping[str, Any] | None) -> Case:
-    """A case from what was flown and what the diagnosis' JSON says of it (None where the flight was not finished)."""
-    sortie = flown["sortie"]
-    hidden = {h["name"]: {k: v["value"] for k, v in h["parameters"].items()} for h in flown["hidden"]}
-    if "wind" in hidden and not {"rotor_drag", "parasitic_drag"} & set(hidden):
-        drag = hidden["wind"]["drag"]  # wind acts through drag, and brings its own where nothing else drags
-        hidden["rotor_drag"] = {"x": drag, "y": drag}
-    error = "" if diagnosis is None else str(diagnosis.get("error", ""))
-    case = Case(
-        number=sortie["number"],
-        kind=sortie["kind"],
-        seconds=flown["seconds"],
-        noise=sortie["noise"],
-        rotor_speeds=sortie["rotor_speeds"],
-        truth=tuple(sorted(hidden)),
-        error=error,
-        controller=sortie["controller"],
-        vehicle=flown["vehicle"],
-    )
-    if diagnosis is None or error:
-        return case
-    rms, turning = diagnosis["residual_rms"], diagnosis.get("rotational_rms")
-    return Case(
-        **{
-            **case.__dict__,
-            "said": tuple(
-                _said(row, hidden, flown["command_delay"])
-                for row in diagnosis["effects"]
-                if row["verdict"] != "included"
-            ),
-            "rms": (rms["before"], rms["after"], rms["noise_floor"]),
-            "rotational": (turning["before"], turning["after"], turning["noise_floor"])
-            if turning
-            else case.rotational,
-            "unexplained": bool(diagnosis["unexplained"]["verdict"]),
-            "diagnosis_seconds": diagnosis["diagnosis_seconds"],
-        }
-    )
-
-
-def _said(row: Mapping[str, Any], hidden: Mapping[str, Mapping[str, float]], believed_delay: float) -> Said:
-    estimates = tuple(
-        Estimated(name, p["value"], p["low"], p["high"], _true(row["name"], name, hidden, believed_delay))
-        for name, p in row["parameters"].items()
-    )
-    return Said(
-        name=row["name"],
-        verdict=row["verdict"],
-        rank=row["rank"],
-        share=row["variance_share"] or 0.0,
-        p_value=1.0 if row["p_value"] is None else row["p_value"],
-        group=tuple(row["indistinguishable_from"]),
-        estimates=estimates,
-        seen_in=row.get("seen_in", "acceleration"),
-        confidence=row.get("confidence"),
-    )
-
-
-def _true(
-    effect: str, parameter: str, hidden: Mapping[str, Mapping[str, float]], believed_delay: float
-) -> float | None:
-    """The true value of a parameter, None where it has none."""
-    if effect not in hidden:
-        return None
-    numbers = hidden[effect]
-    if effect == "rotor_damage":
-        return numbers["loss"] if parameter == f"loss_{round(numbers['rotor'])}" else 0.0
-    name = TRUTH.get(effect, {}).get(parameter)
-    if name is None:
-        return None
-    return numbers[name] + (believed_delay if effect == "transport_delay" else 0.0)

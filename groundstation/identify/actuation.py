@@ -17,7 +17,6 @@ from trueflight.groundstation.reading import segments
 from trueflight.models.contract import ACTUATION_LIMITS
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model
-from trueflight.models.vehicle import Vehicle
 
 BANDWIDTH = 3.0
 """Hz up to which the rate loop's model has to be right: more than twice the attitude loop's bandwidth."""
@@ -132,23 +131,19 @@ def actuation_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
     Thrust by the model's own delay and lag (or the vehicle file's), rates by what the flights show; what they do
     not show stays 0 and is not undone.
     """
-    delay, lag = _thrust(model)
-    numbers = {"thrust_delay": delay, "thrust_lag": lag}
+    numbers = _thrust(model)
     loop = fit_rate_loop(flights)
     if loop is not None:
         numbers |= {"rate_delay": loop.delay, "rate_lag": loop.lag, "rate_integral": loop.integral}
     return {name: round(min(ACTUATION_LIMITS[name], value), 6) for name, value in numbers.items()}
 
 
-def _thrust(model: Model) -> tuple[float, float]:
-    vehicle: Vehicle = model.vehicle
-    delay, lag = vehicle.command_delay, vehicle.motor_time_constant
-    for term in model.terms:
-        if term.effect == "transport_delay":
-            delay = next(iter(term.values.values()))
-        elif term.effect == "motor_lag":
-            lag = next(iter(term.values.values()))
-    return delay, lag
+def _thrust(model: Model) -> dict[str, float]:
+    vehicle = model.vehicle
+    numbers = {"thrust_delay": vehicle.command_delay, "thrust_lag": vehicle.motor_time_constant}
+    for effect, values in model.effect_chain():
+        numbers |= {p.actuation: values[p.name] for p in effect.parameters if p.actuation in numbers}
+    return numbers
 
 
 def _pieces(flights: Sequence[Flight]) -> list[tuple[np.ndarray, np.ndarray, float]]:

@@ -20,7 +20,7 @@ from statsmodels.stats.sandwich_covariance import S_hac_simple
 
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.models.effect import Effect, Motion, Parameter, Stage
-from trueflight.models.effects import effect_named
+from trueflight.models.effects import CLOCK, effect_named
 from trueflight.models.model import Model, Term
 from trueflight.models.prediction import Chain, apply_effects, motion_of_flight, specific_force
 from trueflight.models.vehicle import Vehicle
@@ -177,11 +177,6 @@ class Fit:
         )
 
 
-CLOCK = {"transport_delay": 1.0, "motor_lag": 0.5}
-"""Samples by which no log tells a delay and a lag: columns are aligned to one, and a command that is held for a sample
-looks, between samples, like one that is half a sample late and smoothed."""
-
-
 SCALE = 0.005
 """Relative 95 % uncertainty of every value, however well a fit is conditioned: sensitivity tolerance of a MEMS
 accelerometer or gyroscope (TDK ICM-42688-P datasheet: 0.5 %). No law of the catalogue is truer either."""
@@ -215,7 +210,7 @@ def free_parameters(
         margin = 0.0 if within else 2.0 * abs(p.typical - neutral)
         value = (start or {}).get(p.name, neutral + 0.3 * (typical - neutral))
         low, high = p.low - margin, p.high + margin
-        tolerance = period * CLOCK.get(effect.name, 0.0)
+        tolerance = period * p.clock_samples
         value = float(np.clip(value, low + 1e-9, high - 1e-9))
         free.append(FreeParameter(effect.name, p, value, low, high, neutral, tolerance))
     return free
@@ -242,13 +237,13 @@ def fit(
         if (refit is None or term.effect in refit) and not effect.rotational:
             free += free_parameters(effect, problem.survey, term.values or None, period)
     chain_names = list(names)
-    if clock and "transport_delay" not in names:
-        parameter, believed = effect_named("transport_delay").parameters[0], vehicle.command_delay
+    if clock and not any(effect_named(n, problem.effects_directory).shifts_clock for n in names):
+        (parameter,), believed = CLOCK.parameters, vehicle.command_delay
         low, high = max(0.0, believed - period), believed + period
         free.append(
-            FreeParameter("transport_delay", parameter, believed, low, high, believed, period, nuisance=True)
+            FreeParameter(CLOCK.name, parameter, believed, low, high, believed, period, nuisance=True)
         )
-        chain_names.append("transport_delay")
+        chain_names.append(CLOCK.name)
     effects = [effect_named(n, problem.effects_directory) for n in chain_names]
     measured = problem.measured()
 
@@ -407,19 +402,25 @@ def variance_per_independent_sample(problem: Problem, residual: np.ndarray) -> f
     return max(total, float(np.sum(residual**2))) / residual.size
 
 
+def shifted_clock(delay: float) -> tuple[Effect, dict[str, float]]:
+    """A whole delay of so many s between command and measurement, as a link of a chain."""
+    (parameter,) = CLOCK.parameters
+    return CLOCK, {parameter.name: delay}
+
+
 def with_clock(measurement: Measurement, chain: Chain) -> Chain:
     """The chain with the delay between the flight's columns set as well as one sample of freedom allows.
 
     A shift of the clock belongs to a log, not to a model: every comparison finds it anew.
     """
-    if any(effect.name == "transport_delay" for effect, _ in chain):
+    if any(effect.shifts_clock for effect, _ in chain):
         return chain
-    problem, delay = Problem((measurement,)), effect_named("transport_delay")
+    problem = Problem((measurement,))
     believed, period = problem.vehicle.command_delay, measurement.flight.dt
     measured = problem.measured()
 
     def error(value: float) -> float:
-        return float(np.sum((measured - problem.predict([*chain, (delay, {"delay": value})])) ** 2))
+        return float(np.sum((measured - problem.predict([*chain, shifted_clock(value)])) ** 2))
 
     found = optimize.minimize_scalar(
         error,
@@ -427,7 +428,7 @@ def with_clock(measurement: Measurement, chain: Chain) -> Chain:
         method="bounded",
         options={"xatol": 0.02 * period},
     )
-    return [*chain, (delay, {"delay": float(found.x)})]
+    return [*chain, shifted_clock(float(found.x))]
 
 
 def block_errors(fit_: Fit, blocks: np.ndarray) -> np.ndarray:

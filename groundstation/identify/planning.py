@@ -29,6 +29,7 @@ from trueflight.groundstation.identify.fitting import (
     critical_value,
     fit,
     free_parameters,
+    shifted_clock,
     variance_per_independent_sample,
 )
 from trueflight.groundstation.identify.translation import STRONG_EVIDENCE
@@ -36,7 +37,7 @@ from trueflight.groundstation.measured.measurement import Measurement, measure
 from trueflight.groundstation.results import Diagnosis
 from trueflight.models.design import Design
 from trueflight.models.effect import Effect
-from trueflight.models.effects import catalogue, effect_named
+from trueflight.models.effects import EXACT_ROTATION, catalogue, effect_named
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.frames import rotate_inverse
@@ -336,7 +337,7 @@ class _Study:
         self.vehicle, self.directory = vehicle, effects_directory
         self.known = catalogue(effects_directory)
         self.left_out: dict[str, str] = {}
-        terms: tuple[Term, ...] = (Term("rigid_body", {}),)
+        terms: tuple[Term, ...] = (Term(EXACT_ROTATION.name, {}),)
         if diagnosis is not None:
             terms = diagnosis.model.terms
         open_names = list(between) or self._open(diagnosis)
@@ -500,12 +501,9 @@ class _Study:
         with_parameters = [link for link in settled if link[0].parameters]
         without = [link for link in settled if not link[0].parameters]
         slopes([*without, *with_parameters], self.nuisance[:-1], len(without))
-        if all(effect.name != "transport_delay" for effect, _ in settled):
-            delay = effect_named("transport_delay")
-            believed = {"delay": self.vehicle.command_delay + 0.5 * period}
-            columns[:, self.clock] = (
-                (problem.predict([*settled, (delay, believed)]) - base) / (0.5 * period)
-            ).ravel()
+        if not any(effect.shifts_clock for effect, _ in settled):
+            later = shifted_clock(self.vehicle.command_delay + 0.5 * period)
+            columns[:, self.clock] = ((problem.predict([*settled, later]) - base) / (0.5 * period)).ravel()
         for c, own, size in zip(self.candidates, self.own, self.size, strict=True):
             added = [(self.known[n], dict(v)) for n, v in zip(c.names, c.values, strict=True)]
             columns[:, size] = (problem.predict([*settled, *added]) - base).ravel()

@@ -19,10 +19,6 @@ from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.prediction import apply_effects, motion_of_flight
 
-PATH = ("motor_lag", "transport_delay", "thrust_curve", "battery_sag")
-"""Effects that may act between command and rotor speed."""
-BESIDE = ("thrust_gain",)
-"""Fitted beside them: no vehicle file tells what thrust a rotor speed gives."""
 NEAR_HOVER = (0.8, 1.2)
 """Thrust over hover thrust at which the believed curve is trusted to calibrate the rotors."""
 

@@ -28,7 +28,7 @@ from trueflight.groundstation.identify.fitting import (
 )
 from trueflight.groundstation.identify.remainder import unexplained
 from trueflight.groundstation.identify.rotation import RotationalFindings, judge_rates, judge_rotation
-from trueflight.groundstation.identify.rotors import BESIDE, PATH, RotorProblem, has_rotor_speeds
+from trueflight.groundstation.identify.rotors import RotorProblem, has_rotor_speeds
 from trueflight.groundstation.measured.measurement import Measurement, measure
 from trueflight.groundstation.results import Diagnosis, EffectVerdict, ParameterEstimate
 from trueflight.models.effect import Effect, Parameter, Stage
@@ -111,8 +111,8 @@ def _on_the_way(search: _Search, base: Model, rotation: RotationalFindings) -> t
     """
     problem = RotorProblem(search.problem.measurements, base.effects_directory)
     path = _Search(problem, base, None, replace(rotation, terms=()), lambda _: None)
-    path.candidates = [n for n in PATH if n in path.candidates]
-    path.beside = tuple(n for n in BESIDE if n not in base.names())
+    path.candidates = [n for n in path.candidates if path.known[n].before_rotors]
+    path.beside = tuple(n for n, e in path.known.items() if e.scales_rotors and n not in base.names())
     found = path.select()
     left = np.sqrt(found.fit.sse / path.samples)
     floor = min(float(m.noise[2]) for m in problem.measurements)

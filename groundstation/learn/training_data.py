@@ -109,7 +109,7 @@ def samples_of_flights(
     `advance` is called after each flight. Raises `InputError` where a flight lacks position, velocity, attitude or
     command, or where too little of all flights can be used; one flight of many may be too short or too wild.
     """
-    names = feature_names(model.names())
+    names = feature_names(model)
     parts, left_out = [], []
     for number, flight in enumerate(flights):
         for column in ("position", "velocity", "quaternion", "thrust_command"):

@@ -22,11 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from trueflight.groundstation.evaluate.calibration import Case, case_from_table
+from trueflight.groundstation.evaluate.calibration import Case
 from trueflight.groundstation.operate.processes import run_json
+from trueflight.groundstation.study.cases import case_from_table
 from trueflight.models.contract import LQR, LQR_INTEGRAL
 from trueflight.models.database import database
 from trueflight.models.design import load_design
+from trueflight.models.effect import BELOW_CEILING, DESCENT
 from trueflight.models.effects import catalogue
 from trueflight.models.errors import InputError
 from trueflight.models.outside import json_object, read_text
@@ -178,9 +180,9 @@ def _sortie(
 ) -> Sortie:
     (kind,) = generator.choices(list(KINDS), list(KINDS.values()))
     descends = generator.random() < 0.7
-    if "vortex_ring" in hidden and descends:
+    if _shown_in(DESCENT, hidden) and descends:
         kind = "descent"  # no other flight can show it
-    if "ceiling_effect" in hidden and kind == "descent":
+    if _shown_in(BELOW_CEILING, hidden) and kind == "descent":
         kind = "survey"  # it would begin above the ceiling
     return Sortie(
         number=number,
@@ -193,6 +195,12 @@ def _sortie(
         controller=generator.choice(CONTROLLERS if integral else CONTROLLERS[:1]),
         rotor_speeds=generator.random() < 0.5,
     )
+
+
+def _shown_in(flight: str, hidden: Sequence[str]) -> bool:
+    """Whether something is hidden that this kind of flight alone shows."""
+    known = catalogue()
+    return any(name in known and known[name].shown_in == flight for name in hidden)
 
 
 # --- where a flight goes --------------------------------------------------------------------------------------------
@@ -235,7 +243,7 @@ def _legs(sortie: Sortie, vehicle: Vehicle, generator: random.Random) -> Iterato
 def _survey(sortie: Sortie, generator: random.Random) -> Trajectory:
     low, speed = generator.uniform(0.15, 0.4), generator.uniform(2.5, 4.5)
     height = generator.uniform(1.0, TOP - 1.2)
-    if "ceiling_effect" in sortie.hidden:
+    if _shown_in(BELOW_CEILING, sortie.hidden):
         height = TOP - 1.2
     return trajectory("excitation", low=low, speed=speed, height=height)
 
@@ -362,7 +370,8 @@ def diagnose_record(study: Study, sortie: Sortie) -> dict[str, Any]:
 def _work(study: Study, sortie: Sortie) -> Case:
     flown = fly(study, sortie)
     finished = flown["outcome"] == "finished"
-    return case_from_table(flown, diagnose_record(study, sortie) if finished else None)
+    diagnosis = diagnose_record(study, sortie) if finished else None
+    return case_from_table(flown, diagnosis, load_vehicle(study.vehicle))
 
 
 def run(study: Study, wanted: Sequence[Sortie], jobs: int, done: Callable[[Case], None]) -> tuple[Case, ...]:

@@ -54,7 +54,7 @@ def choose_start(
     Raises `InputError` as `choose_model`, and for a network that was trained on what the linear model leaves.
     """
     model = choose_model(flight, which, store, effects)
-    if "rigid_body" in model.names():
+    if model.rotates_exactly:
         return model
     if model.network is not None:
         raise InputError(

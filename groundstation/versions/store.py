@@ -12,7 +12,7 @@ from pathlib import Path
 from trueflight.groundstation.identify.fitting import Problem, fit, model_of
 from trueflight.groundstation.identify.rotation import fit_rotation
 from trueflight.groundstation.measured.measurement import measure
-from trueflight.models.effects import effect_named
+from trueflight.models.effects import EXACT_ROTATION, effect_named
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.model import (
@@ -122,8 +122,8 @@ def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: f
             )
     terms = (
         base.terms
-        if "rigid_body" in base.names() or effect == "rigid_body"
-        else (Term("rigid_body", {}), *base.terms)
+        if base.rotates_exactly or known.exact_rotation
+        else (Term(EXACT_ROTATION.name, {}), *base.terms)
     )
     made = base.with_network(None).with_terms((*terms, Term(effect, known.neutral(base.vehicle))))
     return refit(made, flights, bandwidth)

@@ -10,7 +10,13 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from trueflight.models.effect import Effect
+from trueflight.models.effects import rigid_body, transport_delay
 from trueflight.models.errors import InputError
+
+EXACT_ROTATION: Effect = rigid_body.EFFECT
+"""What every diagnosis starts from: the exact rotation of thrust, instead of the hover linearisation."""
+CLOCK: Effect = transport_delay.EFFECT
+"""The shift in time that every fit is given where its model has none: no log's clock is better than a sample."""
 
 
 @cache

@@ -18,7 +18,8 @@ EFFECT = Effect(
     stage=Stage.SENSOR,
     formula=formula,
     parameters=tuple(
-        Parameter(axis, "m/s^2", f"offset along body {axis}", 0.0, 0.1, -0.8, 0.8) for axis in ("x", "y", "z")
+        Parameter(axis, "m/s^2", f"offset along body {axis}", 0.0, 0.1, -0.8, 0.8, truth=axis)
+        for axis in ("x", "y", "z")
     ),
     needs=("specific_force",),
     manoeuvre="hover at several headings, and tilts both ways",

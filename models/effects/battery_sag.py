@@ -17,10 +17,13 @@ EFFECT = Effect(
     title="thrust follows the battery voltage",
     stage=Stage.THRUST,
     formula=formula,
-    parameters=(Parameter("exponent", "1", "of voltage over nominal voltage", 0.0, 1.0, 0.0, 3.5),),
+    parameters=(
+        Parameter("exponent", "1", "of voltage over nominal voltage", 0.0, 1.0, 0.0, 3.5, truth="exponent"),
+    ),
     needs=("thrust_command", "battery_voltage"),
     manoeuvre="one flight from a full to a nearly empty battery, or flights on both",
     citation="duty cycle times voltage drives the motor, thrust goes with rotor speed squared (Bangura & Mahony 2014)",
     confounded_with=("thrust_gain",),
     generalises=("thrust_gain",),
+    before_rotors=True,
 )

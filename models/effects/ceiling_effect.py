@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from array_api_compat import array_namespace
 
-from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import BELOW_CEILING, Array, Effect, Motion, Parameter, Stage
 
 STRONGEST = 0.6
 """Largest value of the squared ratio: nearer to the ceiling the formula leaves its range."""
@@ -70,4 +70,5 @@ EFFECT = Effect(
     generalises=("thrust_gain",),
     typical_for=just_above,
     starts_for=heights,
+    shown_in=BELOW_CEILING,
 )

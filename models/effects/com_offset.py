@@ -21,8 +21,12 @@ EFFECT = Effect(
     stage=Stage.TORQUE,
     formula=formula,
     parameters=(
-        Parameter("x", "m", "centre of mass along body x, from the believed one", 0.0, 0.005, -0.2, 0.2),
-        Parameter("y", "m", "centre of mass along body y, from the believed one", 0.0, 0.005, -0.2, 0.2),
+        Parameter(
+            "x", "m", "centre of mass along body x, from the believed one", 0.0, 0.005, -0.2, 0.2, truth="x"
+        ),
+        Parameter(
+            "y", "m", "centre of mass along body y, from the believed one", 0.0, 0.005, -0.2, 0.2, truth="y"
+        ),
     ),
     needs=("angular_velocity",),
     manoeuvre="any flight of half a minute, with rolls and pitches both ways and some change of thrust",

@@ -26,7 +26,16 @@ EFFECT = Effect(
     stage=Stage.TORQUE,
     formula=formula,
     parameters=(
-        Parameter("inertia", "kg m^2", "moment of inertia of one rotor with its bell", 0.0, 2e-5, 0.0, 2e-2),
+        Parameter(
+            "inertia",
+            "kg m^2",
+            "moment of inertia of one rotor with its bell",
+            0.0,
+            2e-5,
+            0.0,
+            2e-2,
+            truth="inertia",
+        ),
     ),
     needs=("angular_velocity", "rotor_speed"),
     manoeuvre="quick yaw both ways while rolling and pitching",

@@ -29,7 +29,9 @@ EFFECT = Effect(
     stage=Stage.SENSOR,
     formula=formula,
     parameters=tuple(
-        Parameter(axis, "m", f"position of the accelerometer along body {axis}", 0.0, 0.03, -0.5, 0.5)
+        Parameter(
+            axis, "m", f"position of the accelerometer along body {axis}", 0.0, 0.03, -0.5, 0.5, truth=axis
+        )
         for axis in ("x", "y", "z")
     ),
     needs=("specific_force", "angular_velocity", "thrust_command"),

@@ -20,9 +20,15 @@ EFFECT = Effect(
     stage=Stage.FORCE,
     formula=formula,
     parameters=(
-        Parameter("x", "1/m", "drag over mass and squared speed along body x", 0.0, 0.05, 0.0, 1.0),
-        Parameter("y", "1/m", "drag over mass and squared speed along body y", 0.0, 0.05, 0.0, 1.0),
-        Parameter("z", "1/m", "drag over mass and squared speed along body z", 0.0, 0.05, 0.0, 1.0),
+        Parameter(
+            "x", "1/m", "drag over mass and squared speed along body x", 0.0, 0.05, 0.0, 1.0, truth="x"
+        ),
+        Parameter(
+            "y", "1/m", "drag over mass and squared speed along body y", 0.0, 0.05, 0.0, 1.0, truth="y"
+        ),
+        Parameter(
+            "z", "1/m", "drag over mass and squared speed along body z", 0.0, 0.05, 0.0, 1.0, truth="z"
+        ),
     ),
     needs=("quaternion", "velocity", "thrust_command"),
     manoeuvre="translations at two or more speeds, the fastest at 4 m/s or more",

@@ -14,6 +14,7 @@ EFFECT = Effect(
     stage=Stage.ROTATION,
     formula=formula,
     parameters=(),
+    exact_rotation=True,
     needs=("quaternion", "thrust_command"),
     manoeuvre="any flight with tilt above about ten degrees",
     citation="Newton-Euler equations; Carvalho et al. 2022, eq. (1)-(3)",

@@ -1,5 +1,7 @@
 """One rotor gives less thrust than the others at the same speed."""
 
+from collections.abc import Mapping
+
 from array_api_compat import array_namespace
 
 from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
@@ -24,6 +26,11 @@ def formula(motion: Motion, *, loss_1: Array, loss_2: Array, loss_3: Array, loss
     return motion.with_(thrust=motion.thrust * share, rotor_thrust=weaker)
 
 
+def truth(hidden: Mapping[str, float], neutral: Mapping[str, float]) -> dict[str, float]:
+    """The simulator hides the `loss` of the `rotor` of that number."""
+    return {**neutral, f"loss_{round(hidden['rotor'])}": hidden["loss"]}
+
+
 EFFECT = Effect(
     name="rotor_damage",
     title="one rotor weaker: torque and thrust loss",
@@ -42,4 +49,5 @@ EFFECT = Effect(
     rotational=True,
     seen_as=("thrust_gain",),
     exclusive=True,
+    truth_for=truth,
 )

@@ -24,4 +24,5 @@ EFFECT = Effect(
     citation="second-order expansion about hover of the blend of linear and square, as PX4's THR_MDL_FAC",
     confounded_with=("thrust_gain", "accelerometer_bias"),
     generalises=("thrust_gain",),
+    before_rotors=True,
 )

@@ -13,10 +13,13 @@ EFFECT = Effect(
     title="thrust-to-mass ratio differs from the believed one",
     stage=Stage.THRUST,
     formula=formula,
-    parameters=(Parameter("gain", "1", "true over believed thrust-to-mass ratio", 1.0, 1.05, 0.4, 2.5),),
+    parameters=(
+        Parameter("gain", "1", "true over believed thrust-to-mass ratio", 1.0, 1.05, 0.4, 2.5, truth="gain"),
+    ),
     needs=("thrust_command",),
     manoeuvre="hover, then climbs and descents at two or more accelerations",
     citation="F = m a: specific thrust is c u / m, so a payload, the mass and the thrust constant are one number",
     confounded_with=("thrust_curve", "battery_sag", "accelerometer_bias", "rotor_damage"),
+    scales_rotors=True,
     aliases=("mass", "payload", "thrust constant"),
 )

@@ -19,8 +19,8 @@ EFFECT = Effect(
     stage=Stage.FORCE,
     formula=formula,
     parameters=(
-        Parameter("x", "rad", "lean of the thrust towards body x", 0.0, 0.02, -0.2, 0.2),
-        Parameter("y", "rad", "lean of the thrust towards body y", 0.0, 0.02, -0.2, 0.2),
+        Parameter("x", "rad", "lean of the thrust towards body x", 0.0, 0.02, -0.2, 0.2, truth="x"),
+        Parameter("y", "rad", "lean of the thrust towards body y", 0.0, 0.02, -0.2, 0.2, truth="y"),
     ),
     needs=("quaternion", "thrust_command"),
     manoeuvre="vertical accelerations up and down, from half to one and a half times the hover thrust",

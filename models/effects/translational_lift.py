@@ -23,7 +23,9 @@ EFFECT = Effect(
     stage=Stage.FORCE,
     formula=formula,
     parameters=(
-        Parameter("lift", "1/m", "thrust over mass gained per squared airspeed", 0.0, 0.02, 0.0, 0.3),
+        Parameter(
+            "lift", "1/m", "thrust over mass gained per squared airspeed", 0.0, 0.02, 0.0, 0.3, truth="lift"
+        ),
     ),
     needs=("quaternion", "velocity", "thrust_command"),
     manoeuvre="level translations at two or more speeds, the fastest at 4 m/s or more, both ways",

@@ -4,7 +4,7 @@ import math
 
 from array_api_compat import array_namespace
 
-from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import DESCENT, Array, Effect, Motion, Parameter, Stage
 from trueflight.models.vehicle import GRAVITY
 
 AIR_DENSITY = 1.225
@@ -50,4 +50,5 @@ EFFECT = Effect(
     "Shetty & Selig 2011 (AIAA 2011-1254; small propellers lose up to a third of their thrust); bump by the authors",
     confounded_with=("axial_inflow", "parasitic_drag"),
     generalises=("axial_inflow",),
+    shown_in=DESCENT,
 )

@@ -20,12 +20,13 @@ EFFECT = Effect(
     stage=Stage.AIR,
     formula=formula,
     parameters=(
-        Parameter("x", "m/s", "wind towards east", 0.0, 2.0, -20.0, 20.0),
-        Parameter("y", "m/s", "wind towards north", 0.0, 2.0, -20.0, 20.0),
+        Parameter("x", "m/s", "wind towards east", 0.0, 2.0, -20.0, 20.0, truth="east"),
+        Parameter("y", "m/s", "wind towards north", 0.0, 2.0, -20.0, 20.0, truth="north"),
     ),
     needs=("quaternion", "velocity", "thrust_command"),
     manoeuvre="translations in all directions and a slow full turn in yaw",
     citation="drag follows the velocity relative to the air",
     confounded_with=("accelerometer_bias", "rotor_drag", "parasitic_drag"),
     acts_through=("rotor_drag", "parasitic_drag"),
+    carrier_truth="drag",
 )

@@ -16,7 +16,6 @@ from trueflight.groundstation.evaluate.calibration import (
     NOT_EXCITED,
     NOTHING,
     POSSIBLE,
-    TRUTH,
     Case,
     Claim,
     Estimated,
@@ -31,10 +30,12 @@ from trueflight.groundstation.evaluate.calibration import (
 from trueflight.groundstation.output.as_json import calibration_table
 from trueflight.groundstation.report.calibration import CHARTS, render_calibration
 from trueflight.groundstation.study.calibration_study import TOP, Study, hideable, path_of, setpoints, sorties
+from trueflight.groundstation.study.cases import truth_of
 from trueflight.models.effects import catalogue
 from trueflight.models.errors import run_command_line
 from trueflight.models.reference import trajectory_from_csv
 from trueflight.models.vehicle import load_vehicle
+from trueflight.sim_bridge.truth.effects import EFFECTS
 
 NAMES = ("thrust_gain", "rotor_drag", "wind", "ceiling_effect", "vortex_ring", "com_offset")
 
@@ -210,9 +211,29 @@ def test_a_verdicts_own_confidence_comes_first() -> None:
     assert [c.sure for c in claims_of(told) if c.present] == [0.8]
 
 
-def test_true_values_are_of_parameters_that_exist() -> None:
-    for effect, parameters in TRUTH.items():
-        assert set(parameters) <= {p.name for p in catalogue()[effect].parameters}, effect
+def test_true_values_are_those_of_the_simulator() -> None:
+    vehicle = load_vehicle(VEHICLE)
+    hidden = {
+        "transport_delay": {"extra_delay": 0.02},
+        "rotor_damage": {"rotor": 3.0, "loss": 0.1},
+        "wind": {"speed": 5.0, "east": 3.0, "north": -4.0, "drag": 0.2},
+        "thrust_curve": {"curvature": 0.5},
+    }
+    told = [{"name": n, "parameters": {k: {"value": v} for k, v in p.items()}} for n, p in hidden.items()]
+    true = truth_of(told, vehicle)
+    assert true["transport_delay"] == {"delay": vehicle.command_delay + 0.02}
+    assert true["rotor_damage"] == {"loss_1": 0.0, "loss_2": 0.0, "loss_3": 0.1, "loss_4": 0.0}
+    assert true["wind"] == {"x": 3.0, "y": -4.0}
+    assert true["rotor_drag"] == {"x": 0.2, "y": 0.2}, "wind brings the drag that it acts through"
+    assert true["thrust_curve"] == {}, "another law: no true value"
+    with_drag = [*told, {"name": "parasitic_drag", "parameters": {k: {"value": 0.05} for k in "xyz"}}]
+    assert "rotor_drag" not in truth_of(with_drag, vehicle)
+
+
+def test_what_an_effect_calls_its_truth_is_a_number_of_the_simulator() -> None:
+    for name, effect in catalogue().items():
+        named = {p.truth for p in effect.parameters} | {effect.carrier_truth}
+        assert named - {""} <= set(EFFECTS[name].units if name in EFFECTS else ()), name
 
 
 # --- flights --------------------------------------------------------------------------------------------------------

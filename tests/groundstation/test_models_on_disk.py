@@ -79,7 +79,7 @@ def test_onnx_file_predicts_as_the_model_and_carries_its_contract(flight) -> Non
         *("accelerometer_bias", "imu_lever_arm", "com_offset", "gyroscopic")
     }  # lag and delay are looked over
     session = onnxruntime.InferenceSession(export_onnx(model, flight))
-    names = feature_names(model.names())
+    names = feature_names(model)
     assert names[-2:] == ("cos_psi", "sin_psi")
     columns = features_of_flight(flight)
     features = feature_matrix(columns, names)

@@ -9,15 +9,21 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 import pytest
+from simulated import simulated
 
 from trueflight.groundstation.commands.effect import write_template
+from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.writing import write_flight
 from trueflight.models.errors import InputError
+from trueflight.models.export import export_onnx
+from trueflight.models.features import feature_matrix, feature_names, features_of_flight
 from trueflight.models.frames import rotate_inverse
+from trueflight.models.model import Term, rigid_body_model
 
 BIN = Path(sys.executable).parent
-SAMPLE = Path(__file__).parents[2] / "samples" / "rotorpy" / "nothing_hidden" / "identify.parquet"
+ROOT = Path(__file__).parents[2]
+SAMPLE = ROOT / "samples" / "rotorpy" / "nothing_hidden" / "identify.parquet"
 PULL = 0.3
 
 
@@ -71,6 +77,42 @@ def test_template_is_ranked_fitted_added_and_exported(flight_with_tether: Path, 
     higher[0, 0] = 3.0
     delta = [session.run(None, {"features": f})[0][0] for f in (hover, higher)]
     np.testing.assert_allclose(delta[1] - delta[0], [0, 0, -pull["value"]], atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def breeze(tmp_path_factory) -> Path:
+    """A folder with a user's effect that acts as wind does, in a file of another name."""
+    folder = tmp_path_factory.mktemp("mine")
+    text = (ROOT / "models" / "effects" / "wind.py").read_text()
+    (folder / "breeze.py").write_text(text.replace('name="wind"', 'name="breeze"'))
+    return folder
+
+
+def test_wind_of_ones_own_is_found_as_wind_is(breeze: Path) -> None:
+    flight = simulated(5, "wind:4")
+    result = diagnose(flight, rigid_body_model(flight.vehicle, str(breeze)))
+    told = {e.name: e for e in result.effects}
+    assert told["rotor_drag"].verdict == "missing"
+    assert {told["wind"].verdict, told["breeze"].verdict} == {"possible"}
+    assert {told["wind"].rank, told["breeze"].rank} > {None}
+    assert "breeze" in told["wind"].indistinguishable_from and "wind" in told["breeze"].indistinguishable_from
+    values = [[p.value for p in told[name].parameters] for name in ("wind", "breeze")]
+    np.testing.assert_allclose(*values, rtol=1e-3)
+
+
+def test_wind_of_ones_own_turns_with_yaw_in_the_exported_correction(breeze: Path) -> None:
+    flight = simulated(5, "wind:4")
+    deltas = []
+    for name in ("wind", "breeze"):
+        model = rigid_body_model(flight.vehicle, str(breeze))
+        drag = Term("rotor_drag", {"x": 0.2, "y": 0.2})
+        model = model.with_terms((*model.terms, drag, Term(name, {"x": 3.0, "y": -2.0})))
+        session = onnxruntime.InferenceSession(export_onnx(model, flight))
+        features = feature_matrix(features_of_flight(flight), feature_names(model))
+        deltas.append(session.run(None, {"features": features})[0])
+    np.testing.assert_allclose(deltas[1], deltas[0], atol=1e-6)
+    without = rigid_body_model(flight.vehicle, str(breeze))
+    assert feature_names(without) == feature_names(model)[:-2], "yaw goes in for the breeze alone"
 
 
 def test_template_is_listed_with_its_formula(tmp_path) -> None:
