@@ -16,10 +16,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from trueflight.companion.flight import Decision, FlightStateMachine, Mission
+from trueflight.companion.flight import FlightStateMachine
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import GuardLimits
 from trueflight.companion.message_rates import Rates, link_too_slow, odometry_too_low
+from trueflight.companion.mission import Mission
 from trueflight.companion.mission_request import mission_request
 from trueflight.companion.outcome import IDLE, LANDING, MISSION, SILENT, TAKEOFF
 from trueflight.companion.pose import PoseFeed
@@ -27,6 +28,7 @@ from trueflight.companion.records import Records
 from trueflight.companion.shadow import Shadow, ShadowLimits
 from trueflight.companion.stopping import Safety
 from trueflight.companion.store import ModelStore
+from trueflight.companion.succession import Decision
 from trueflight.companion.vehicle_link import VehicleLink
 from trueflight.models.contract import CORRECTED
 from trueflight.models.design import Design
@@ -111,7 +113,7 @@ class Director:
         the ground, and `live` for a model that has proved itself in an earlier flight; what became of a model in the
         shadow is told by events and the status.
         """
-        candidate = self.flight.candidate
+        candidate = self.flight.models.candidate
         if candidate is not None:
             reason = f"{candidate.title} is in the shadow for another {candidate.remaining:.1f} s; wait, or roll back"
             return {"accepted": False, "reason": reason}
@@ -144,7 +146,7 @@ class Director:
 
     def roll_back(self) -> dict[str, Any]:
         """Withdraw the model in the shadow; without one, make the previous model live, also in flight."""
-        candidate = self.flight.candidate
+        candidate = self.flight.models.candidate
         if candidate is not None:
             self.flight.withdraw_candidate()
             reason = (
@@ -167,14 +169,14 @@ class Director:
             answer = self.store.roll_back()
             if answer["accepted"]:
                 self.flight.roll_back(earlier_model.watched(self.guard_limits) if earlier_model else None)
-                self.flight.live = self.store.live_name
+                self.flight.models.live = self.store.live_name
                 self.emit("info", "model_rolled_back", f"by command: {answer['reason']}")
             return answer
 
     def status(self) -> dict[str, Any]:
         """What the companion is doing, for JSON."""
         latest, flight = self.link.latest, self.flight
-        candidate, not_ready = flight.candidate, self.not_ready()
+        candidate, not_ready = flight.models.candidate, self.not_ready()
         with self._lock:
             missions = [
                 {
@@ -333,7 +335,7 @@ class Director:
         shadow = Shadow(watch, self.shadow_limits, self.store.title(name), seconds)
         self.flight.try_model(shadow)
         # The next tick takes it over; an answer before that would describe the state of before.
-        self._wait(lambda: self.flight.candidate is shadow, _ORDER_TIMEOUT)
+        self._wait(lambda: self.flight.models.candidate is shadow, _ORDER_TIMEOUT)
         return ""
 
     def _on_the_ground(self, name: str, title: str, reason: str, seconds: float | None) -> dict[str, Any]:
@@ -353,15 +355,15 @@ class Director:
             self.store.discard(name)
             self.emit("warning", "model_refused", f"{title}: {failed}")
             return {"accepted": False, "reason": failed}
-        self.flight.live = self.store.live_name
+        self.flight.models.live = self.store.live_name
         self.emit("info", "model_live", f"{title} is live: it has proved itself in an earlier flight")
         return {"accepted": True, "state": "live", "reason": reason, **self.store.describe()}
 
     def _settle(self) -> None:
         """Put on the disk what became of models in flight."""
-        while self.flight.decisions:
-            self._keep(self.flight.decisions.popleft())
-        self.flight.live = self.store.live_name
+        while self.flight.models.decisions:
+            self._keep(self.flight.models.decisions.popleft())
+        self.flight.models.live = self.store.live_name
 
     def _keep(self, decision: Decision) -> None:
         name, store = decision.model, self.store
@@ -473,7 +475,7 @@ class Director:
         if not self._wait(lambda: flight.home_set, 1.0):
             return "no odometry after arming"
         staged = self.store.staged_name
-        if staged and flight.candidate is None:
+        if staged and flight.models.candidate is None:
             self._try(staged)
         return ""
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from trueflight.companion.flight import Mission
+from trueflight.companion.mission import Mission
 from trueflight.models.design import Design
 from trueflight.models.errors import InputError
 from trueflight.models.record import FlightRecorder

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trueflight.companion.flight import FlightStateMachine, Mission
+from trueflight.companion.flight import FlightStateMachine
 from trueflight.companion.latest import Latest
 from trueflight.companion.law.control import ControlLaw
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import Range, Watch
+from trueflight.companion.mission import Mission
 from trueflight.companion.odometry import Odometry
 from trueflight.companion.outcome import IDLE, LANDING, MISSION, SILENT, TAKEOFF, Outcome
 from trueflight.companion.stopping import Safety
