@@ -1,9 +1,4 @@
-"""The phases of a flight, and what one tick of it decided.
-
-idle -> takeoff -> mission -> landing -> idle
-           |          |          |
-           +----------+----------+-> silent -> idle
-"""
+"""The phases of a flight, and what one tick of it decided; how one phase follows another tells `companion.phases`."""
 
 from __future__ import annotations
 
