@@ -6,7 +6,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 SEED ?= 7
 
-.PHONY: setup demo test lint bench faults clean
+.PHONY: setup demo test lint wheel-test bench faults clean
 
 setup: $(VENV)/.installed
 
@@ -30,6 +30,10 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# sdist and wheel, and the wheel in a new environment beside foreign folders of our names.
+wheel-test: setup
+	$(BIN)/python tests/packaging/install.py
 
 bench: setup
 	for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
