@@ -136,6 +136,12 @@ print(json.dumps({"ours": ours, "version": trueflight.__version__, "foreign": [m
                   "installed": importlib.metadata.version("trueflight"), "own": models.own.ANSWER}))
 """
 
+REAL_FLIGHTS = """
+from rich.console import Console
+from trueflight.groundstation.commands.demo import real_flights
+assert real_flights(Console()) == []
+"""
+
 
 def check_beside_foreign_folders(environment: Environment, work: Path, version: str) -> None:
     """In a folder with its own `models/` and `companion/`: both are importable, and a flight is diagnosed."""
@@ -166,6 +172,8 @@ def check_beside_foreign_folders(environment: Environment, work: Path, version: 
     )
     assert flown["outcome"] == "finished", flown
     environment.run(programs / "companion", "--help", cwd=work)
+    said = environment.run("-c", REAL_FLIGHTS, cwd=work)
+    assert said.startswith("No real flights: samples/crazyflie") and said.count("\n") == 1, said
 
 
 def check_uninstalling(environment: Environment, wheel: Path, foreign: Path) -> None:
