@@ -16,7 +16,7 @@ ALLOWED = {
     "companion": {"trueflight.companion", "mavsdk", "zenoh", "onnxruntime", "mcap", "google"},
     "groundstation": {
         "trueflight.groundstation", "torch", "control", "scipy", "statsmodels", "rerun", "pyarrow", "pyulog", "onnx",
-        "onnxruntime", "mcap", "mcap_ros2", "google", "zenoh", "jinja2", "markupsafe", "matplotlib", "dask",
+        "onnxruntime", "mcap", "mcap_ros2", "google", "zenoh", "jinja2", "markupsafe", "matplotlib", "pandas", "dask",
         "distributed", "cryptography",
     },
     "sim_bridge": {
@@ -48,6 +48,10 @@ ROOMS: dict[str, set[str]] = {
     "views": {"results", "operate", "evaluate", "learn", "output"},
     "report": {"results", "evaluate", "output"},
     "study": {"reading", "operate", "identify", "evaluate", "learn", "versions", "output"},
+    "library": {
+        "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",
+        "report",
+    },
     "commands": {
         "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",
         "views", "report", "study",

@@ -431,6 +431,7 @@ def model_list(
     from rich.table import Table
 
     from trueflight.groundstation.output.as_json import model_table
+    from trueflight.groundstation.output.tables import fit_rms
     from trueflight.groundstation.versions.store import versions
     from trueflight.models.model import read_model
 
@@ -458,7 +459,7 @@ def model_list(
             f"v{m.version}",
             parent,
             ", ".join((*m.names(), *(() if m.network is None else (m.network.label,)))),
-            f"{_fit_rms(m):.3f}",
+            f"{fit_rms(m):.3f}",
             m.created,
         )
     console.print(table)
@@ -480,38 +481,14 @@ def model_show(
     Example: groundstation model show v2 --vehicle-name quad5
     """
     from trueflight.groundstation.output.as_json import model_table
+    from trueflight.groundstation.output.tables import print_model
     from trueflight.groundstation.versions.store import find
 
     model = find(store, vehicle or _only_vehicle(store), which)
     if as_json:
         print_json(model_table(model))
         return
-    console.print(
-        f"{model.label} of {model.vehicle.name}, made {model.created}, fit RMS {_fit_rms(model):.3f} m/s²"
-    )
-    for term in model.terms:
-        values = ", ".join(
-            f"{k} = {v:.4g} [{term.intervals[k][0]:.4g}, {term.intervals[k][1]:.4g}]"
-            if k in term.intervals
-            else f"{k} = {v:.4g}"
-            for k, v in term.values.items()
-        )
-        console.print(f"  {term.effect}  {values}", highlight=False)
-    if (n := model.network) is not None:
-        console.print(
-            f"  {n.label}  {n.parameters} parameters, recipe {n.recipe}, seed {n.seed}, hash {n.hash}; held-out RMS "
-            f"{n.fit.get('before_rms', 0):.3f} -> {n.fit.get('validation_rms', 0):.3f} m/s² "
-            f"(noise floor {n.fit.get('noise_floor', 0):.3f})",
-            highlight=False,
-        )
-        ranges = zip(n.features, n.low, n.high, strict=True)
-        told = ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges)
-        console.print(f"  trained within {told}", highlight=False)
-
-
-def _fit_rms(model: Model) -> float:
-    """Residual RMS of the fit, m/s²: of the network's training where there is one."""
-    return model.fit.get("rms", 0.0) if model.network is None else model.network.fit.get("train_rms", 0.0)
+    print_model(console, model)
 
 
 @model_app.command("export")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -24,10 +24,6 @@ class AroundWhat(StrEnum):
 
     design = "design"
     reference = "reference"
-
-
-MOST_LEAVINGS = 8
-PARTS: tuple[Literal["total", "model", "attitude"], ...] = ("total", "model", "attitude")
 
 
 def register(app: typer.Typer) -> None:
@@ -62,6 +58,7 @@ def bound_command(
     """
     from trueflight.groundstation.evaluate.bound import predict_tube
     from trueflight.groundstation.evaluate.tracking import read_designed
+    from trueflight.groundstation.output.flown import print_tube
 
     flown, believed, label = read_designed(flight, design, vehicle)
     source = None if bound_from is None else read_designed(bound_from, design, vehicle)[0]
@@ -73,61 +70,14 @@ def bound_command(
     if as_json:
         print_json(_table(tube))
         return
-    _print(tube)
+    print_tube(console, tube)
     if rrd is not None:
         console.print(f"Rerun recording: {escape(str(rrd))}")
 
 
-def _print(tube: Tube) -> None:
-    from rich.table import Table
-
-    d = tube.disturbance
-    beyond = "that of the linear design" if d.around == "design" else "what the position loop asks for"
-    table = Table(title=f"{escape(tube.label)}: acceleration d beyond {beyond} (m/s²)")
-    for heading in ("axis", "largest |d|", "over memory", "model alone", "attitude alone", "radius of tube"):
-        table.add_column(heading, justify="left" if heading == "axis" else "right")
-    parts = [abs(d.total).max(axis=0), *(d.radius(tube.balls, part) for part in PARTS), tube.radius]
-    for k, axis in enumerate("xyz"):
-        table.add_row(axis, *(f"{part[k]:.2f}" for part in parts))
-    console.print(table)
-    table = Table(title=f"the tube around the {d.around}, world axes")
-    for heading in ("axis", "decay", "position", "flown", "velocity", "flown ", "inside"):
-        table.add_column(heading, justify="left" if heading == "axis" else "right")
-    most, ball, inside = abs(tube.distance).max(axis=0), tube.ball, tube.inside
-    for k, axis in enumerate("xyz"):
-        table.add_row(
-            axis,
-            f"{tube.balls[k].decay:.2f} 1/s",
-            f"± {ball[k, 0]:.2f} m",
-            f"{most[k, 0]:.2f} m",
-            f"± {ball[k, 1]:.2f} m/s",
-            f"{most[k, 1]:.2f} m/s",
-            f"{100 * inside[k]:.2f} %",
-        )
-    console.print(table)
-    memories = sorted({f"{0.5 / ball.decay:.1f}" for ball in tube.balls})
-    console.print(
-        f"radius: the most that d of {escape(tube.bound_from)} has as RMS over the loop's memory of "
-        f"{' to '.join(memories)} s, below {d.bandwidth:g} Hz; the sensors resolve {tube.resolution.max():.2f} m/s²",
-        highlight=False,
-    )
-    if len(tube.jumps):
-        console.print(
-            f"the reference jumps {len(tube.jumps)} times: the tube widens there by as much", highlight=False
-        )
-    for leaving in tube.leavings[:MOST_LEAVINGS]:
-        console.print(
-            f"[yellow]leaves the tube[/yellow] in {leaving.axis} at t = {leaving.start:.2f} s, for "
-            f"{leaving.end - leaving.start:.2f} s: V^(1/2) {leaving.level:.2f} m/s², allowed {leaving.allowed:.2f}",
-            highlight=False,
-        )
-    if len(tube.leavings) > MOST_LEAVINGS:
-        console.print(f"and {len(tube.leavings) - MOST_LEAVINGS} times more", highlight=False)
-    if not tube.leavings:
-        console.print("the flight never leaves the tube")
-
-
 def _table(tube: Tube) -> dict[str, Any]:
+    from trueflight.groundstation.output.flown import PARTS
+
     d = tube.disturbance
     most, inside = abs(tube.distance).max(axis=0), tube.inside
     radii = {part: d.radius(tube.balls, part) for part in PARTS}

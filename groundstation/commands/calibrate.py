@@ -11,9 +11,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from trueflight.groundstation.commands.options import QUAD5, JsonOption
+from trueflight.groundstation.commands.options import JsonOption
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.vehicle import QUAD5
 
 if TYPE_CHECKING:
     from trueflight.groundstation.evaluate.calibration import Calibration, Case, Proportion

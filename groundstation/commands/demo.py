@@ -41,10 +41,9 @@ from trueflight.models.errors import InputError
 from trueflight.models.export import export_onnx, not_exported
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model, rigid_body_model
-from trueflight.models.vehicle import Vehicle, load_vehicle
+from trueflight.models.vehicle import QUAD5, Vehicle, load_vehicle
 from trueflight.models.whole_file import write_whole
 
-VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
 SURVEY: tuple[str, dict[str, float]] = ("excitation", {})
 TASK: tuple[str, dict[str, float]] = ("lemniscate", {"speed": 2.5, "height": 0.8})
 MARK = ".trueflight-demo"
@@ -70,11 +69,11 @@ def demonstrate(
     """Run the whole job in `folder` on an effect drawn from `seed` (or on the effects in `hidden`)."""
     started = time.monotonic()
     _make(folder)
-    vehicle = load_vehicle(VEHICLE)
+    vehicle = load_vehicle(QUAD5)
     sealed = folder / "answer.sealed"
     truth = [word for name in (hidden or ["random"]) for word in ("--hidden", name)]
     truth += ["--seed", str(seed), "--sealed", str(sealed)]
-    with running_rig(folder, VEHICLE, truth) as (endpoint, pids):
+    with running_rig(folder, QUAD5, truth) as (endpoint, pids):
         _step(
             console, "Three processes", f"bridge {pids[0]}, companion {pids[1]}, ground station {os.getpid()}"
         )

@@ -408,6 +408,7 @@ def track_command(
 ) -> None:
     """Flights against the linear behaviour expected of them: mean squared error per axis, as in the paper."""
     from trueflight.groundstation.evaluate.tracking import told_apart, track_file
+    from trueflight.groundstation.output.flown import print_tracking
 
     tracked = told_apart([track_file(path, design, vehicle) for path in flights])
     if rrd is not None:
@@ -417,28 +418,9 @@ def track_command(
     if as_json:
         print_json([_tracking_row(t, tracked[0]) for t in tracked])
         return
-    from rich.table import Table
-
     for t in tracked:
         _print_notes(t.flight)
-    table = Table(title="mean squared error against the expected linear behaviour")
-    table.add_column("axis", no_wrap=True)
-    for t in tracked:
-        table.add_column(escape(t.label), justify="right", overflow="fold")
-    if len(tracked) > 1:
-        table.add_column("change", justify="right")
-    rows = [(f"{axis} (m²)", [t.mse[k] for t in tracked]) for k, axis in enumerate("xyz")]
-    rows += [
-        (f"{axis} (rad²)", [t.mse_zeta[k] for t in tracked])
-        for k, axis in enumerate(("roll", "pitch", "yaw"))
-    ]
-    rows += [("distance, rms (m)", [t.rms for t in tracked])]
-    for what, values in rows:
-        change = (
-            [f"{100 * (values[-1] / values[0] - 1):+.0f} %"] if len(tracked) > 1 and values[0] > 0 else []
-        )
-        table.add_row(what, *(f"{v:.3g}" for v in values), *change)
-    console.print(table)
+    print_tracking(console, tracked)
     if rrd is not None:
         console.print(f"Rerun recording: {escape(str(rrd))}")
 

@@ -7,9 +7,6 @@ from typing import Annotated
 
 import typer
 
-QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
-"""The vehicle that stands where none is named: the 5-inch quadrotor."""
-
 # --- flights, and what they are held against ------------------------------------------------------------------------
 
 FlightArgument = Annotated[

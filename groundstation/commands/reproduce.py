@@ -15,10 +15,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from trueflight.groundstation.commands.options import QUAD5, JsonOption
+from trueflight.groundstation.commands.options import JsonOption
 from trueflight.models.errors import InputError
 from trueflight.models.outside import read_text
 from trueflight.models.printed import print_json
+from trueflight.models.vehicle import QUAD5
 from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:

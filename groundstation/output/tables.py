@@ -11,6 +11,7 @@ from rich.text import Text
 
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.results import Comparison, Diagnosis, EffectVerdict, WaterfallStep, WhereItFails
+from trueflight.models.model import Model
 
 VERDICT_STYLE = {
     "missing": "bold red",
@@ -191,3 +192,32 @@ def print_side_by_side(console: Console, beside: SideBySide) -> None:
     for name, where in zip(beside.names, beside.where, strict=True):
         told = where.regions[0].text if where.regions else "evenly, no region holds much more than its share"
         console.print(f"[bold]{escape(name)}[/bold]: {escape(told)}", highlight=False)
+
+
+def print_model(console: Console, model: Model) -> None:
+    """One version: its effects with values and 95 % intervals, and its network."""
+    made = f"made {model.created}" if model.created else "not saved"
+    console.print(f"{model.label} of {model.vehicle.name}, {made}, fit RMS {fit_rms(model):.3f} m/s²")
+    for term in model.terms:
+        values = ", ".join(
+            f"{k} = {v:.4g} [{term.intervals[k][0]:.4g}, {term.intervals[k][1]:.4g}]"
+            if k in term.intervals
+            else f"{k} = {v:.4g}"
+            for k, v in term.values.items()
+        )
+        console.print(f"  {term.effect}  {values}", highlight=False)
+    if (n := model.network) is not None:
+        console.print(
+            f"  {n.label}  {n.parameters} parameters, recipe {n.recipe}, seed {n.seed}, hash {n.hash}; held-out RMS "
+            f"{n.fit.get('before_rms', 0):.3f} -> {n.fit.get('validation_rms', 0):.3f} m/s² "
+            f"(noise floor {n.fit.get('noise_floor', 0):.3f})",
+            highlight=False,
+        )
+        ranges = zip(n.features, n.low, n.high, strict=True)
+        told = ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges)
+        console.print(f"  trained within {told}", highlight=False)
+
+
+def fit_rms(model: Model) -> float:
+    """Residual RMS of the fit, m/s²: of the network's training where there is one."""
+    return model.fit.get("rms", 0.0) if model.network is None else model.network.fit.get("train_rms", 0.0)

@@ -99,11 +99,20 @@ STYLE = {
 }
 
 
+class Picture(Figure):
+    """A figure that a notebook shows by itself, without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        out = io.BytesIO()
+        self.savefig(out, format="png", dpi=110)
+        return out.getvalue()
+
+
 def figure(
     rows: int, columns: int, width: float, height: float, sharex: bool = False
 ) -> tuple[Figure, np.ndarray]:
     """A figure of `width` by `height` inches with its axes (rows, columns)."""
-    made = Figure(figsize=(width, height), layout="constrained", facecolor="none")
+    made = Picture(figsize=(width, height), layout="constrained", facecolor="none")
     axes = made.subplots(rows, columns, squeeze=False, sharex=sharex)
     for one in axes.flat:
         one.set_facecolor("none")

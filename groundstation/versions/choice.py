@@ -19,21 +19,24 @@ DECIDES = ("mass", "hover_thrust", "thrust_model")
 
 def choose_model(
     flight: Flight,
-    which: str | int | Path | None = None,
+    which: Model | str | int | Path | None = None,
     store: str | Path = DEFAULT_STORE,
     effects: str | Path | None = None,
 ) -> Model:
     """The model that `flight` is held against.
 
-    `which` is a version number (`3`, "v3"), a model's JSON file, or "linear" for the paper's linear model; None is
-    the newest version of the flight's vehicle in `store`, and where there is none yet exact rotation alone.
-    `effects` is a folder of the user's own effects. Raises `InputError` where there is no such version, and for a
-    model of another vehicle.
+    `which` is a model, a version number (`3`, "v3"), a model's JSON file, or "linear" for the paper's linear model;
+    None is the newest version of the flight's vehicle in `store`, and where there is none yet exact rotation alone.
+    `effects` is a folder of the user's own effects. Raises `InputError` where there is no such version, and for a model
+    of another vehicle.
     """
     directory = None if effects is None else str(effects)
     if which == "linear":
         return linear_model(flight.vehicle)
-    if which is None:
+    model: Model | None
+    if isinstance(which, Model):
+        model = which
+    elif which is None:
         model = newest(Path(store), flight.vehicle, directory)
     else:
         model = find(Path(store), flight.vehicle.name, str(which))
@@ -45,7 +48,7 @@ def choose_model(
 
 def choose_start(
     flight: Flight,
-    which: str | int | Path | None = None,
+    which: Model | str | int | Path | None = None,
     store: str | Path = DEFAULT_STORE,
     effects: str | Path | None = None,
 ) -> Model:
@@ -66,7 +69,7 @@ def choose_start(
 
 def choose_line(
     flight: Flight,
-    which: str | int | Path | None = None,
+    which: Model | str | int | Path | None = None,
     store: str | Path = DEFAULT_STORE,
     effects: str | Path | None = None,
 ) -> list[Model]:

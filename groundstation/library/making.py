@@ -1,0 +1,230 @@
+"""What the library makes: models with one effect more, networks, gains, ONNX files, and flights in the simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from trueflight.groundstation.library.flights import Flight, read
+from trueflight.groundstation.library.models import Model, as_model
+from trueflight.groundstation.library.questions import Which
+from trueflight.groundstation.library.shown import Summary
+from trueflight.groundstation.versions.choice import check_vehicle, choose_model
+from trueflight.groundstation.versions.store import DEFAULT_STORE, add_effect
+from trueflight.models import flight as columns
+from trueflight.models import model as versions
+from trueflight.models.design import Design
+from trueflight.models.effect import Effect
+from trueflight.models.effects import catalogue
+from trueflight.models.errors import InputError
+from trueflight.models.vehicle import QUAD5, Vehicle, load_vehicle
+
+if TYPE_CHECKING:
+    from trueflight.groundstation.learn.training import Epoch
+
+
+@dataclass(frozen=True, repr=False)
+class Training:
+    """A network that was trained on what a model leaves over: `model` is that model with it, `history` every epoch
+    (RMS per axis in m/s²), `before` and `after` the RMS (m/s²) of the remainder on the blocks held out.
+
+    `seconds` is the flight time that it was trained and checked on; `noise_floor` (m/s²) what sensor noise leaves.
+    """
+
+    model: Model
+    history: tuple[Epoch, ...]
+    before: float
+    after: float
+    noise_floor: float
+    seconds: float
+
+    def summary(self) -> Summary:
+        """The model with the network, as `groundstation model show` prints it."""
+        return self.model.summary()
+
+    def __repr__(self) -> str:
+        return (
+            f"<Training over {len(self.history)} epochs, {self.seconds:.0f} s of flight: remainder "
+            f"{self.before:.3f} -> {self.after:.3f} m/s², noise floor {self.noise_floor:.3f} m/s²>"
+        )
+
+    def _repr_html_(self) -> str:
+        return self.summary().html
+
+
+def effects(directory: str | Path | None = None) -> dict[str, Effect]:
+    """The catalogue of effects by name: parameters with units, what excites each, what it is confounded with, source.
+
+    `directory` is a folder of your own effects, one file each, beside those of trueflight. Raises `InputError` for a
+    file there that is no effect.
+    """
+    return dict(catalogue(None if directory is None else str(directory)))
+
+
+def add(
+    flight: columns.Flight | Sequence[columns.Flight],
+    effect: str,
+    *,
+    model: Which = None,
+    bandwidth: float | None = None,
+    store: str | Path = DEFAULT_STORE,
+    effects: str | Path | None = None,
+) -> Model:
+    """A model with one `effect` more, every parameter fitted anew to the `flight` (or several); not saved.
+
+    `model`, `bandwidth` (Hz), `store` and `effects` as for `compare`. `Model.save` writes it as a version. Parameters
+    have the units that `effects()` tells. A network of the model is dropped: it was trained without this effect.
+
+    Raises `InputError` for an effect that is there already, acts only through one that is not, or needs columns that a
+    flight lacks.
+    """
+    flights = [flight] if isinstance(flight, columns.Flight) else list(flight)
+    base = choose_model(_first(flights), model, store, effects)
+    return as_model(add_effect(base, effect, flights, bandwidth))
+
+
+def train(
+    flights: Sequence[columns.Flight],
+    *,
+    model: Which = None,
+    layers: Sequence[int] = (64, 64),
+    recipe: str = "default",
+    epochs: int | None = None,
+    seed: int = 0,
+    bandwidth: float | None = None,
+    store: str | Path = DEFAULT_STORE,
+    effects: str | Path | None = None,
+) -> Training:
+    """Train a network on what a model does not explain of `flights`, two thirds of them in blocks; not saved.
+
+    `model`, `bandwidth` (Hz), `store` and `effects` as for `compare`. `layers` are the widths of the hidden layers,
+    `recipe` is "default" or "paper" (Carvalho et al. 2022, section V), `epochs` at most so many (None: the recipe's),
+    `seed` draws the split, the first weights and the batches.
+
+    Raises `InputError` where flights lack columns or are too short, and for impossible layers.
+    """
+    from trueflight.groundstation.learn.training import recipe_named, train, with_epochs
+    from trueflight.groundstation.learn.training_data import samples_of_flights
+
+    base = choose_model(_first(flights), model, store, effects)
+    for flight in flights:
+        check_vehicle(base, flight)
+    samples = samples_of_flights(flights, base, bandwidth)
+    done = train(samples, with_epochs(recipe_named(recipe), epochs), layers, seed)
+    fit = done.network.fit
+    return Training(
+        as_model(base.with_network(done.network)),
+        done.history,
+        fit["before_rms"],
+        fit["validation_rms"],
+        fit["noise_floor"],
+        samples.seconds,
+    )
+
+
+def export(
+    flights: columns.Flight | Sequence[columns.Flight], output: str | Path, *, model: versions.Model
+) -> Path:
+    """Write a `model` to `output` as one ONNX file with its contract, ready to deploy.
+
+    `flights` give the range it was trained in, its golden vectors and what they show of the rate loop (s). Returns the
+    path. Raises `InputError` for a flight of another vehicle, and where the file cannot be written.
+    """
+    from trueflight.groundstation.identify.actuation import actuation_of
+    from trueflight.models.export import export_onnx
+    from trueflight.models.whole_file import write_whole
+
+    flown = [flights] if isinstance(flights, columns.Flight) else list(flights)
+    for flight in flown:
+        check_vehicle(model, flight)
+    _first(flown)
+    data = export_onnx(model, *flown, actuation=actuation_of(model, flown))
+    write_whole(Path(output), data, "the model", "choose another output")
+    return Path(output)
+
+
+def design(
+    vehicle: Vehicle | str | Path,
+    *,
+    bandwidth: float | None = None,
+    attitude_bandwidth: float | None = None,
+    rate: float = 100.0,
+) -> Design:
+    """Gains of the linear cascade for a `vehicle` (or its file), by LQR, with and without integral.
+
+    `bandwidth` is that of the position loop and `attitude_bandwidth` that of the attitude loop, Hz (None: the usual);
+    `rate` that of the controller, Hz. The gains are those of Carvalho et al. 2022, equations (13) and (16).
+
+    Raises `InputError` where delay and lag of the vehicle, or how close both loops are, forbid it.
+    """
+    from trueflight.groundstation.design.integral_design import with_integral
+    from trueflight.groundstation.design.linear_design import (
+        ATTITUDE_BANDWIDTH,
+        POSITION_BANDWIDTH,
+        make_design,
+    )
+
+    believed = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    made = make_design(
+        believed, bandwidth or POSITION_BANDWIDTH, attitude_bandwidth or ATTITUDE_BANDWIDTH, rate
+    )
+    return with_integral(made, believed)
+
+
+def simulate(
+    output: str | Path,
+    *,
+    trajectory: str = "excitation",
+    parameters: Mapping[str, float] | None = None,
+    vehicle: str | Path = QUAD5,
+    hidden: str | Sequence[str] = (),
+    correction: str | Path | None = None,
+    controller: str = "",
+    design: str | Path | None = None,
+    noise: float = 1.0,
+    seed: int = 0,
+) -> Flight:
+    """Fly in the simulator, by the companion's own control law, and read the record that it writes to `output` (.mcap).
+
+    `trajectory` with its `parameters` (SI units) is one of `groundstation trajectories`, or a CSV file of setpoints.
+    `vehicle` is the vehicle.toml of what its owner believes, `hidden` what the simulated vehicle has beside it: NAME,
+    NAME:SIZE, "random" (drawn by `seed`; `reveal` tells), "rich". `correction` is an ONNX file, `controller` lqr,
+    lqr_integral or corrected (by default corrected where there is a correction), `design` a file of gains (None: that
+    beside the vehicle). `noise` is a factor on that of the sensors.
+
+    It runs `sim-bridge`, the program, and so needs it installed. Raises `InputError` for whatever that refuses.
+    """
+    from trueflight.groundstation.operate.processes import run_json
+
+    words: list[object] = ["sim-bridge", "fly", "--trajectory", trajectory, "-o", output, "--json"]
+    words += ["--vehicle", vehicle, "--seed", seed, "--noise", noise]
+    for name, value in (parameters or {}).items():
+        words += ["--set", f"{name}={value:g}"]
+    for name in [hidden] if isinstance(hidden, str) else hidden:
+        words += ["--hidden", name]
+    for option, given in (("--model", correction), ("--controller", controller), ("--design", design)):
+        if given:
+            words += [option, given]
+    run_json(words)
+    return read(output)
+
+
+def reveal(flight: columns.Flight) -> dict[str, dict[str, float]]:
+    """What was hidden at random in a simulated `flight`: values by parameter, by effect, in SI units.
+
+    Raises `InputError` where there is no sealed answer beside its record.
+    """
+    from trueflight.groundstation.operate.processes import run_json
+
+    told = run_json(["sim-bridge", "reveal", Path(flight.origin).with_suffix(".sealed"), "--json"])
+    return {
+        h["name"]: {name: float(p["value"]) for name, p in h["parameters"].items()} for h in told["effects"]
+    }
+
+
+def _first(flights: Sequence[columns.Flight]) -> columns.Flight:
+    if not flights:
+        raise InputError("no flight given; pass at least one")
+    return flights[0]

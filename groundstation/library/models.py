@@ -1,0 +1,56 @@
+"""Model versions of the library: their parameters as numbers, and kept in a store."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from trueflight.groundstation.library.shown import Summary, answering, summary_of
+from trueflight.models import model as versions
+
+
+@dataclass(frozen=True, repr=False)
+class Model(versions.Model):
+    """A model of one vehicle: the hover linearisation, `terms` (effects with fitted values) and a `network`.
+
+    `vehicle` is the one it was made for, `version` its number in a store (0: not saved), `fit` the figures of its fit
+    (residual RMS in m/s²). Everything in trueflight that takes a `models.model.Model` takes this one.
+    """
+
+    @property
+    def params(self) -> dict[str, float]:
+        """Fitted values by `effect.parameter`, in the units that `effects()` tells."""
+        return {f"{t.effect}.{name}": value for t in self.terms for name, value in t.values.items()}
+
+    def conf_int(self) -> dict[str, tuple[float, float]]:
+        """95 % intervals (low, high) by `effect.parameter`, of the values that were estimated with one."""
+        return {f"{t.effect}.{name}": ends for t in self.terms for name, ends in t.intervals.items()}
+
+    def summary(self) -> Summary:
+        """Effects with their values and intervals, and the network, as `groundstation model show` prints them."""
+        from trueflight.groundstation.output.tables import print_model
+
+        return summary_of(lambda console: print_model(console, self))
+
+    def save(self, store: str | Path, parent: versions.Model | None = None) -> Model:
+        """Write this model to the folder `store` as the next version of its vehicle, made from `parent` (None: from
+        none that is in the store).
+
+        Returns the saved version, with its number. Raises `InputError` where it cannot be written.
+        """
+        from trueflight.groundstation.versions.store import save
+
+        made, _ = save(Path(store), self, parent if parent is not None and parent.version else None)
+        return as_model(made)
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name} {value:.4g}" for name, value in self.params.items())
+        return f"<Model {self.label} of {self.vehicle.name}{': ' if values else ''}{values}>"
+
+    def _repr_html_(self) -> str:
+        return self.summary().html
+
+
+def as_model(model: versions.Model) -> Model:
+    """A model with answers."""
+    return model if isinstance(model, Model) else answering(Model, model)

@@ -1,0 +1,201 @@
+"""What one asks of a flight. Each function is the command of the same name, and takes its arguments in the same order:
+the flight, what is asked of it, and by name which model, which flight held out, which design, how fine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from trueflight.groundstation.library.models import as_model
+from trueflight.groundstation.library.shown import answering
+from trueflight.groundstation.versions.choice import choose_design, choose_line, choose_model
+from trueflight.groundstation.versions.store import DEFAULT_STORE
+from trueflight.models.design import Design
+from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.model import Model
+
+if TYPE_CHECKING:
+    from trueflight.groundstation.evaluate.bound import Around
+    from trueflight.groundstation.library.answers import (
+        Comparison,
+        Diagnosis,
+        SideBySide,
+        Tracking,
+        Tube,
+        WhereItFails,
+    )
+
+Which = Model | str | int | Path | None
+"""A model: itself, its number in the store, its file, "linear"; None is the newest in the store, else exact
+rotation."""
+
+
+def compare(
+    flight: Flight,
+    *,
+    model: Which = None,
+    bandwidth: float | None = None,
+    store: str | Path = DEFAULT_STORE,
+    effects: str | Path | None = None,
+) -> Comparison:
+    """The acceleration that a model predicts, against the measured one: residual, noise floor, open-loop error.
+
+    `flight` has N samples. `model` is a model itself, its number in `store` (a folder of versions), its file, or
+    "linear" for the hover linearisation alone; None is the newest version, and where there is none exact rotation.
+    `bandwidth` is that of the low-pass on both sides, Hz (None: what the flight resolves). `effects` is a folder of
+    your own effects. Accelerations (N, 3) come back in m/s², heading frame.
+
+    Raises `InputError` where the flight lacks what a comparison needs, and for a model of another vehicle.
+    """
+    from trueflight.groundstation.evaluate.compare import compare
+    from trueflight.groundstation.library.answers import Comparison
+
+    return answering(Comparison, compare(flight, choose_model(flight, model, store, effects), bandwidth))
+
+
+def side_by_side(
+    flights: Sequence[Flight],
+    *,
+    models: Sequence[Which] = (None,),
+    bandwidth: float | None = None,
+    store: str | Path = DEFAULT_STORE,
+    effects: str | Path | None = None,
+) -> SideBySide:
+    """Several `flights`, each with each of `models`, over the same bins: errors in m/s², heading frame.
+
+    `models` as `model` of `compare`; `bandwidth` (Hz), `store` and `effects` as there. Raises `InputError` as `compare`
+    does.
+    """
+    from trueflight.groundstation.evaluate.side_by_side import side_by_side
+    from trueflight.groundstation.library.answers import SideBySide
+    from trueflight.groundstation.reading.several import told_apart
+
+    chosen = [[choose_model(f, which, store, effects) for which in models] for f in flights]
+    return answering(SideBySide, side_by_side(told_apart(flights), chosen, bandwidth))
+
+
+def where(
+    flight: Flight,
+    *,
+    model: Which = None,
+    bandwidth: float | None = None,
+    store: str | Path = DEFAULT_STORE,
+    effects: str | Path | None = None,
+) -> WhereItFails:
+    """Where in the `flight` a model fails: the residual (m/s²) over height, speed, tilt, thrust, voltage, time, place.
+
+    `model`, `bandwidth` (Hz), `store` and `effects` as for `compare`. Raises `InputError` as `compare` does.
+    """
+    return compare(flight, model=model, bandwidth=bandwidth, store=store, effects=effects).where
+
+
+def diagnose(
+    flight: Flight,
+    *,
+    model: Which = None,
+    validate: Flight | None = None,
+    bandwidth: float | None = None,
+    store: str | Path = DEFAULT_STORE,
+    effects: str | Path | None = None,
+) -> Diagnosis:
+    """Which effect is missing from a model: ranked, with parameters and 95 % intervals, checked on held-out data.
+
+    `flight` is what effects are fitted to, `validate` another flight of the same vehicle, held out of every fit.
+    `model`, `bandwidth` (Hz), `store` and `effects` as for `compare`, with exact rotation in any case. Errors come back
+    in m/s²; docs/diagnosis.md tells how verdicts are reached.
+
+    Raises `InputError` where a flight lacks what a comparison needs or is too short, and for a model of another
+    vehicle.
+    """
+    from trueflight.groundstation.identify.translation import diagnose
+    from trueflight.groundstation.library.answers import Diagnosis
+
+    line = choose_line(flight, model, store, effects)
+    found = diagnose(flight, line[-1], validate, bandwidth)
+    return answering(
+        Diagnosis,
+        found,
+        model=as_model(found.model),
+        held_out=validate,
+        line=tuple(line),
+        asked_bandwidth=bandwidth,
+    )
+
+
+def report(
+    flight: Flight,
+    output: str | Path,
+    *,
+    model: Which = None,
+    validate: Flight | None = None,
+    design: Design | str | Path | None = None,
+    bandwidth: float | None = None,
+    store: str | Path = DEFAULT_STORE,
+    effects: str | Path | None = None,
+) -> Diagnosis:
+    """Diagnose a `flight` and write it to `output` as one HTML page that opens offline and prints.
+
+    `model`, `validate`, `bandwidth` (Hz), `store` and `effects` as for `diagnose`; `design` as for `track`, for the
+    page's part on tracking. Returns the diagnosis. Raises `InputError` as `diagnose` does, and where the page cannot be
+    written.
+    """
+    found = diagnose(
+        flight, model=model, validate=validate, bandwidth=bandwidth, store=store, effects=effects
+    )
+    found.report(output, _design(flight, design))
+    return found
+
+
+def track(flight: Flight, *, design: Design | str | Path | None = None) -> Tracking:
+    """How far a `flight` was from its linear design: mean squared error per axis (m², rad²) against what the design
+    would have flown from the same start, world ENU (Carvalho et al. 2022, tables I and II).
+
+    `design` holds the gains, or is their file; None takes those that the flight's record carries.
+
+    Raises `InputError` where there is no design, where references or states are missing, or nothing lasts long enough.
+    """
+    from trueflight.groundstation.evaluate.tracking import track
+    from trueflight.groundstation.library.answers import Tracking
+
+    return answering(Tracking, track(flight, _needed(flight, design)))
+
+
+def bound(
+    flight: Flight,
+    *,
+    design: Design | str | Path | None = None,
+    earlier: Flight | None = None,
+    around: Around = "design",
+) -> Tube:
+    """The tube that the stability bound predicts for a `flight`, and whether it stayed inside (m, m/s, world ENU).
+
+    `design` as for `track`. `earlier` is the flight that tells the bound on disturbances; None takes the flight itself.
+    The tube stands `around` the linear design's own flight ("design") or the "reference". docs/control.md derives it.
+
+    Raises `InputError` where a flight lacks what this needs.
+    """
+    from trueflight.groundstation.evaluate.bound import predict_tube
+    from trueflight.groundstation.library.answers import Tube
+
+    return answering(
+        Tube, predict_tube(flight, _needed(flight, design), flight.name, around, bound_from=earlier)
+    )
+
+
+def _design(flight: Flight, design: Design | str | Path | None) -> Design | None:
+    if not isinstance(design, Design):
+        return choose_design(flight, design)
+    design.check(flight.vehicle)
+    return design
+
+
+def _needed(flight: Flight, design: Design | str | Path | None) -> Design:
+    found = _design(flight, design)
+    if found is None:
+        raise InputError(
+            f"{flight.origin or flight.name}: the flight carries no design; pass design=FILE, or what "
+            "tf.design(vehicle) makes"
+        )
+    return found
