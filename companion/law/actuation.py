@@ -104,15 +104,12 @@ class RateModel:
         `share` of the delay, 0 to 1.
         """
         then = self._time - share * self.actuation.rate_delay
-        before, angle, rate = self._past[0]
-        for time, later_angle, later_rate in self._past:
-            if time >= then:
-                part = (then - before) / (time - before) if time > before else 1.0
-                part = max(0.0, part)
-                angle = _between(angle, later_angle, part)
-                rate = _between(rate, later_rate, part)
-                break
-            before, angle, rate = time, later_angle, later_rate
+        moments = iter(self._past)
+        before = after = next(moments)
+        while after[0] < then:  # ends: the newest is now
+            before, after = after, next(moments)
+        part = (then - before[0]) / (after[0] - before[0]) if after is not before else 1.0
+        angle, rate = _between(before[1], after[1], part), _between(before[2], after[2], part)
         (x, y), (p, q) = self._angle, self._rate
         return (x - angle[0], y - angle[1]), (p - rate[0], q - rate[1])
 

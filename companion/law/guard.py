@@ -190,8 +190,8 @@ class Guard:
 
         A model that expects too much of the ground effect takes thrust away, and down there is no room for that.
         """
-        share = height / self.limits.ground
-        return self.limits.authority[2] * (1.0 if share > 1.0 else share if share > 0.0 else 0.0)
+        share = height / self.limits.ground  # above 1 the authority itself is the limit
+        return self.limits.authority[2] * share if share > 0.0 else 0.0  # false for NaN as well
 
     def _enter(self, watch: Watch) -> None:
         self._live = watch = self._tripped.get(watch.name, watch) if watch.name else watch

@@ -141,7 +141,7 @@ class Watch:
         raws: list[Vector] = []
         begin = self._clock()
         try:
-            for x, y, z in self._rows(rows):
+            for (x, y, z), _ in zip(self._rows(rows), rows, strict=True):
                 raws.append((float(x), float(y), float(z)))
         except Exception as error:  # noqa: BLE001 - whatever a model raises, the flight goes on without it
             self.trip(f"the model raised {type(error).__name__}")

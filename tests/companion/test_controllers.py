@@ -214,6 +214,28 @@ def test_the_trim_turns_with_the_vehicle_for_what_stands_still_in_the_world() ->
     assert turned == pytest.approx((0.0, -blown[0], blown[2]), abs=1e-9)
 
 
+def test_the_trim_does_not_grow_where_the_limits_leave_no_more() -> None:
+    """What is missing there is not the correction."""
+    controller, still = (
+        Corrected(LAW, Oracle(), TrimLimits()),
+        ReferenceSample((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0),
+    )
+
+    def at(x: float) -> State:
+        return State((x, 0.0, 1.0), ZERO, (1.0, 0.0, 0.0, 0.0), 1.0, 16.0)
+
+    controller.start()
+    controller.step(at(0.0), lambda ahead: still, DT)
+    for _ in range(100):
+        near = controller.step(at(0.3), lambda ahead: still, DT).trim
+    controller.step(at(50.0), lambda ahead: still, DT)  # what it asks for is cut from here on
+    first = controller.step(at(50.0), lambda ahead: still, DT).trim
+    for _ in range(100):
+        far = controller.step(at(50.0), lambda ahead: still, DT).trim
+    assert near[0] > 0.0
+    assert far == first
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.floats(0.005, 0.08), st.floats(0.02, 0.1), st.floats(0.0, 8.0))
 def test_the_rate_model_tells_what_the_commands_on_their_way_will_do(seed, delay, lag, integral) -> None:

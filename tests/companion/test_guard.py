@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trueflight.companion.law.actuation import ACTS_AT_ONCE
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import GuardLimits, Range, Watch
 from trueflight.models.contract import FEATURES
@@ -287,3 +288,80 @@ def test_a_gap_gives_no_jump() -> None:
     assert applied[0] <= LIMITS.slew[0] * 0.1
     assert step(guard, INSIDE, -1.0)[0] == applied
     assert step(guard, INSIDE, math.nan)[0] == applied
+
+
+def test_a_guard_without_a_model_changes_nothing() -> None:
+    guard = Guard(None, limits=LIMITS)
+    guard.start()
+    assert (guard.limits, guard.status, guard.live, guard.last_good) == (LIMITS, "off", "", "")
+    assert (guard.engaged, guard.actuation, guard.settled, guard.tripped) == (0.0, ACTS_AT_ONCE, True, False)
+    assert (guard.wants_yaw, guard.inference_time, guard.why_tripped("a")) == (False, 0.0, "")
+    assert guard.step([INSIDE] * 3, 0.02, DT) == ((0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0, 0.0))
+    assert Guard(None).limits == GuardLimits()
+
+
+def test_a_model_is_asked_from_the_first_tick_on_in_which_it_may_act_and_in_no_other() -> None:
+    asked: list = []
+    guard = guard_of(lambda features: asked.append(features) or (0.5, 0.0, 0.0))
+    run(guard, 0.2)
+    assert asked == []
+    guard.start()
+    step(guard, INSIDE, 0.0)  # the fade begins: nothing of it acts, but it shows what it would say
+    assert len(asked) == 3
+    run(guard, 0.1)
+    guard.stop()
+    run(guard, 0.2)
+    assert guard.status == "off"
+    asked.clear()
+    run(guard, 0.2)
+    assert asked == []
+
+
+def test_the_rate_told_is_how_fast_the_applied_correction_is_about_to_change() -> None:
+    slopes = [4.0, -8.0]
+    guard = guard_of(lambda features: (slopes[0] * features[1], slopes[1] * features[1], 0.0))
+    moving = [(1.0, 0.25), (1.0, 0.375), (1.0, 0.25)]
+    assert guard.step(moving, 0.125, DT).rate == (0.0, 0.0)
+    guard.start()
+    share = 0.0
+    for _ in range(60):
+        share = min(1.0, share + DT / LIMITS.fade)
+        assert guard.step(moving, 0.125, DT).rate == pytest.approx((4.0 * share, -8.0 * share))
+    for slopes[0], slopes[1] in ((-12.0, 12.0), (12.0, -12.0)):  # a change of 3 m/s² in an eighth of a second
+        rate = guard.step([(1.0, -0.125), (1.0, 0.125), INSIDE], 0.0625, DT).rate
+        assert rate == (math.copysign(30.0, slopes[0]), math.copysign(30.0, slopes[1])), "cut at the slew"
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_each_axis_moves_no_faster_than_its_slew_and_ends_at_its_authority(axis: int, sign: float) -> None:
+    limits = GuardLimits(authority=(1.0, 2.0, 4.0), slew=(8.0, 16.0, 64.0), fade=1e-9)
+    wanted = [0.0, 0.0, 0.0]
+    wanted[axis] = sign * 1.5 * limits.authority[axis]
+    guard = guard_of(constant(*wanted), limits)
+    guard.start()
+    for k in range(1, 20):
+        applied = step(guard, INSIDE, 0.0078125)[0]
+        expected = [0.0, 0.0, 0.0]
+        expected[axis] = sign * min(limits.authority[axis], k * 0.0078125 * limits.slew[axis])
+        assert applied == tuple(expected)
+
+
+def test_time_that_stands_still_or_is_unknown_moves_nothing() -> None:
+    guard = guard_of(constant(1.0))
+    guard.start()
+    before = run(guard, 0.2)[-1]
+    for dt in (0.0, -0.5, math.nan):
+        assert step(guard, INSIDE, dt)[0] == before
+        assert guard.engaged == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("height", [math.nan, 0.0, -1.0, -math.inf])
+def test_at_no_height_or_an_unknown_one_no_model_takes_thrust_away(height: float) -> None:
+    guard = guard_of(constant(0.0, 0.0, 2.0))
+    guard.start()
+    for _ in range(100):
+        assert guard.step([INSIDE] * 3, 0.02, DT, height).applied == (0.0, 0.0, 0.0)
+    for _ in range(100):
+        high = guard.step([INSIDE] * 3, 0.02, DT).applied  # how high is not told: high enough
+    assert high == (0.0, 0.0, 2.0)

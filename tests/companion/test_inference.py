@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
-from onnx_models import RANGES, constant_model, drag_model, linear_model
+from onnx import TensorProto, helper
+from onnx_models import RANGES, constant_model, drag_model, linear_model, packed
 
-from trueflight.companion.law.inference import MAX_BYTES, check_model
+from trueflight.companion.law.actuation import Actuation
+from trueflight.companion.law.inference import MAX_BYTES, check_model, open_model, warm_up
+from trueflight.companion.law.watch import GuardLimits
 from trueflight.companion.store import ModelStore
 from trueflight.models import contract
+from trueflight.models.errors import InputError
 from trueflight.models.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
@@ -136,6 +142,93 @@ def test_a_model_that_is_too_slow_is_refused() -> None:
     verdict = check_model(onnx, VEHICLE, deadline=1e-5)
     assert "at most" in verdict.reason
     assert check_model(onnx, replace(VEHICLE), deadline=1.0).accepted
+
+
+def one_row_at_a_time(onnx_file: bytes) -> bytes:
+    """The same file, made for a batch of one."""
+    model = onnx.ModelProto.FromString(onnx_file)
+    for port in (*model.graph.input, *model.graph.output):
+        port.type.tensor_type.shape.dim[0].dim_value = 1
+    return bytes(model.SerializeToString())
+
+
+def test_a_file_made_for_one_row_answers_several_as_well() -> None:
+    file = linear_model(RNG.normal(size=(10, 3)))
+    several, single = (check_model(one, VEHICLE).model for one in (file, one_row_at_a_time(file)))
+    assert several is not None and single is not None
+    rows = RNG.normal(size=(3, 10)).tolist()
+    assert np.array(single.rows(rows)) == pytest.approx(np.array(several.rows(rows)), abs=1e-5)
+    assert single.rows(rows)[1] == pytest.approx(single(rows[1]))
+
+
+def test_the_watch_over_a_model_knows_it_by_what_its_file_says() -> None:
+    actuation = {"rate_lag": 0.04, "thrust_delay": 0.01}
+    file = linear_model(np.zeros((12, 3)), (1.0, 0.0, 0.0), metadata={contract.KEY_ACTUATION: actuation})
+    model = check_model(file, VEHICLE).model
+    assert model is not None
+    limits = GuardLimits(fade=0.5)
+    watch = model.watched(limits)
+    assert (watch.name, watch.wants_yaw, watch.limits) == (contract.model_hash(file), True, limits)
+    assert watch.actuation == Actuation(rate_lag=0.04, thrust_delay=0.01)
+    middle = [0.5 * (low + high) for low, high in RANGES.values()]
+    assert watch.evaluate(middle, 0.01)[1] == (1.0, 0.0, 0.0)
+    assert model.watched().limits == GuardLimits()
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (MemoryError(), "its check needs too much memory"),
+        (RecursionError(), "its check failed (RecursionError): the file is hostile or damaged"),
+    ],
+)
+def test_what_no_check_foresaw_is_refused_as_well(error: Exception, reason: str, monkeypatch) -> None:
+    def fails(model: object) -> None:
+        raise error
+
+    monkeypatch.setattr("trueflight.companion.law.inference._check_range", fails)
+    verdict = check_model(constant_model(0.1, 0.0, 0.0), VEHICLE)
+    assert (verdict.accepted, verdict.model, verdict.reason) == (False, None, reason)
+
+
+def test_warmed_up_a_check_loads_nothing_more() -> None:
+    """It runs where no file can be opened any more."""
+    warm_up()
+    before = set(sys.modules)
+    assert check_model(constant_model(0.1, 0.0, 0.0), VEHICLE).accepted
+    assert set(sys.modules) == before
+
+
+def test_a_file_that_was_changed_on_board_is_not_opened() -> None:
+    file = constant_model(0.1, 0.0, 0.0)
+    model = check_model(file, VEHICLE).model
+    assert model is not None
+    assert open_model(file, model.info)([0.0] * 10) == pytest.approx([0.1, 0.0, 0.0])
+    with pytest.raises(InputError, match="the file on board is another one; deploy it again"):
+        open_model(constant_model(0.2, 0.0, 0.0), model.info)
+    damaged = file[:200]
+    with pytest.raises(InputError, match="not an ONNX model"):
+        open_model(damaged, replace(model.info, hash=contract.model_hash(damaged)))
+
+
+def test_metadata_that_are_no_text_are_refused() -> None:
+    file = constant_model(0.1, 0.0, 0.0)
+    assert b"linear" in file
+    assert (
+        "no text (UTF-8)" in check_model(file.replace(b"linear", b"\xff\xfe\xfd\xfc\xfb\xfa"), VEHICLE).reason
+    )
+
+
+def test_a_graph_that_opens_and_cannot_be_evaluated_is_refused() -> None:
+    nodes = [
+        helper.make_node("ReduceMax", [contract.INPUT_NAME], ["most"], axes=[1], keepdims=0),
+        helper.make_node("Cast", ["most"], ["row"], to=TensorProto.INT64),
+        helper.make_node("Gather", ["table", "row"], [contract.OUTPUT_NAME]),
+    ]
+    table = {"table": np.zeros((1, 3), dtype=np.float32)}  # one row, and a voltage asks for the sixteenth
+    verdict = check_model(packed(nodes, table, lambda features: np.zeros((len(features), 3))), VEHICLE)
+    assert "it cannot be evaluated" in verdict.reason
+    assert "\n" not in verdict.reason
 
 
 class TestStore:

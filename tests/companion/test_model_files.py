@@ -115,15 +115,32 @@ def test_a_second_graph_appended_to_the_bytes_is_seen_as_well() -> None:
     assert "external data" in why_not_self_contained(drag_model(0.1) + more.SerializeToString())
 
 
-def test_nested_without_end_or_in_another_format_is_refused() -> None:
-    model = onnx.ModelProto.FromString(drag_model(0.1))
-    model.graph.node.append(nested(14, constant(elsewhere())))
-    assert why_not_self_contained(model.SerializeToString())
-    deep = b""
-    for _ in range(3000):
-        deep = b"\x3a" + len(deep).to_bytes(1, "little") if len(deep) < 128 else b"\x3a\x80"
+def within(number: int, payload: bytes) -> bytes:
+    """A message as field `number` (below 16) of another, as protobuf writes it."""
+    head, size = bytes([number << 3 | 2]), len(payload)
+    while size > 127:
+        head, size = head + bytes([size & 127 | 128]), size >> 7
+    return head + bytes([size]) + payload
+
+
+@pytest.mark.parametrize(
+    ("graphs", "reason"), [(18, ""), (25, "nested more than 64 deep"), (40, "nested too deeply")]
+)
+def test_graphs_nested_without_end_are_refused(graphs: int, reason: str) -> None:
+    """Also where nothing in them is kept elsewhere; protobuf itself gives up at a hundred messages."""
+    graph = b""
+    for _ in range(graphs):
+        graph = within(1, within(5, within(6, graph)))  # node, attribute, g
+    told = why_not_self_contained(within(7, graph))
+    assert (reason in told) and bool(told) == bool(reason)
+
+
+def test_another_format_is_refused_and_a_whole_file_is_not() -> None:
     assert "ONNX Runtime itself" in why_not_self_contained(b"\0\0\0\0ORTM" + bytes(100))
     assert why_not_self_contained(drag_model(0.1)) == ""
+    said = onnx.ModelProto.FromString(drag_model(0.1))
+    said.graph.initializer[0].data_location = TensorProto.DEFAULT  # it says so itself: here
+    assert why_not_self_contained(said.SerializeToString()) == ""
 
 
 KINDS = ["text", 5, 10**400, 1.5, True, None, [], {}, [1, 2, 3], ["a"], [[]], [{}], {"a": 1}, [None] * 4]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 from itertools import pairwise
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import GuardLimits, Range, Watch
 from trueflight.companion.shadow import Shadow, ShadowLimits, error_acceleration
@@ -251,3 +253,105 @@ def test_the_measured_error_acceleration_is_the_papers(quaternion, force, thrust
     linear = (9.81 * pitch, -9.81 * roll, thrust / 0.75 - 9.81)
     measured = error_acceleration(tuple(q.tolist()), force, thrust, 0.75)
     np.testing.assert_allclose(measured, heading - linear, atol=1e-6)
+
+
+def one(answer: tuple[float, float, float], name: str, takes: float = 0.0, **more) -> Watch:
+    """A watch over a constant model that takes so many seconds a moment."""
+    now = [0.0]
+
+    def model(features):
+        now[0] += takes
+        return answer
+
+    return Watch(model, RANGES, LIMITS, name=name, clock=lambda: now[0], **more)
+
+
+def half_over(old: Watch, new: Watch, trips: list | None = None) -> Guard:
+    """A guard in the middle of the change from one model to another: each has half of the effect."""
+    guard = Guard(old, None if trips is None else lambda name, why: trips.append((name, why)))
+    guard.start()
+    run(guard, 0.6)
+    guard.succeed(new)
+    run(guard, 0.25)
+    return guard
+
+
+def test_while_they_change_both_are_asked_the_live_one_s_answer_is_recorded_and_both_take_their_time() -> (
+    None
+):
+    guard = half_over(one((0.5, 0.0, 0.0), "a", 1e-4), one((1.0, 0.0, 0.0), "b", 2e-4))
+    correction = guard.step([INSIDE] * 3, AHEAD, 0.0)
+    assert correction.raw == (1.0, 0.0, 0.0)
+    assert correction.applied[0] == pytest.approx(0.75)
+    assert guard.inference_time == pytest.approx(3 * 1e-4 + 3 * 2e-4)
+    assert (guard.engaged, guard.settled) == (pytest.approx(1.0), False)
+    run(guard, 0.3)
+    assert guard.inference_time == pytest.approx(3 * 2e-4), "only of this tick"
+    assert guard.settled
+
+
+def test_where_the_one_that_leaves_trips_the_other_still_acts_in_that_very_tick() -> None:
+    trips: list[tuple[str, str]] = []
+    bad = [False]
+    old = watch(lambda features: (math.nan if bad[0] else 0.1, 0.0, 0.0), "a")
+    guard = half_over(old, one((0.1, 0.0, 0.0), "b"), trips)
+    bad[0] = True
+    assert guard.step([INSIDE] * 3, AHEAD, 0.01).applied[0] == pytest.approx(0.1 * 0.52)
+    assert trips == [("a", "the model returned a number that is not finite")]
+    assert (guard.live, guard.last_good, guard.tripped) == ("b", "", False), "nothing is left to go back to"
+    guard.roll_back()
+    assert guard.live == ""
+
+
+def test_what_is_known_of_the_actuation_changes_over_with_the_models() -> None:
+    slow, quick = Actuation(0.03, 0.06, 2.0, 0.01, 0.04), Actuation(0.01, 0.02, 1.0, 0.03, 0.02)
+    guard = Guard(one((0.0, 0.0, 0.0), "a", actuation=slow))
+    assert guard.actuation == ACTS_AT_ONCE, "no model acts yet"
+    guard.start()
+    run(guard, 0.25)
+    assert guard.actuation == slow
+    run(guard, 0.5)
+    guard.succeed(one((0.0, 0.0, 0.0), "b", actuation=quick))
+    assert guard.actuation == slow
+    run(guard, 0.125)
+    np.testing.assert_allclose(
+        astuple(guard.actuation), np.average([astuple(slow), astuple(quick)], 0, [0.76, 0.24])
+    )
+    run(guard, 0.5)
+    assert guard.actuation == quick
+
+
+def test_yaw_is_told_to_models_as_long_as_one_of_them_wants_it() -> None:
+    plain, turned = one((0.0, 0.0, 0.0), "a"), one((0.0, 0.0, 0.0), "b", wants_yaw=True)
+    assert not Guard(plain).wants_yaw
+    assert Guard(turned).wants_yaw
+    guard = half_over(plain, turned)
+    assert guard.wants_yaw
+    run(guard, 0.5)
+    guard.succeed(one((0.0, 0.0, 0.0), "c"))
+    assert guard.wants_yaw, "b still acts"
+    run(guard, 0.6)
+    guard.succeed(one((0.0, 0.0, 0.0), "d"))
+    assert not guard.wants_yaw
+
+
+def test_a_model_that_enters_while_the_correction_is_off_does_not_act() -> None:
+    guard = Guard(one((1.0, 0.0, 0.0), "a"))
+    guard.succeed(one((1.0, 0.0, 0.0), "b"))
+    assert (guard.live, guard.last_good, guard.engaged, guard.status) == ("b", "a", 0.0, "off")
+    assert np.all(run(guard, 0.2) == 0.0)
+
+
+def test_models_without_a_name_are_not_taken_for_one_another() -> None:
+    guard = Guard(one((math.nan, 0.0, 0.0), ""))
+    guard.start()
+    run(guard, 0.1)
+    assert guard.tripped
+    guard.succeed(one((0.5, 0.0, 0.0), ""))
+    assert (guard.tripped, guard.last_good) == (False, ""), "what tripped is nothing to go back to"
+    assert run(guard, 0.6)[-1][0] == 0.5
+
+
+def test_of_a_model_that_did_not_trip_there_is_no_reason_why() -> None:
+    guard = flying(constant(1.0))
+    assert (guard.why_tripped("a"), guard.why_tripped("b")) == ("", "")

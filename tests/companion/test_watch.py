@@ -1,0 +1,290 @@
+"""A watch believes nothing of its model: where exactly it stops believing, and what it says then."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
+from trueflight.companion.law.watch import ZERO, GuardLimits, Range, Watch
+
+LIMITS = GuardLimits(authority=(2.0, 4.0, 8.0), absurd=4.0, patience=1.0, deadline=0.25, misses=3, stall=1.0)
+Z, VX = Range("z", "m", 0.0, 4.0), Range("vx", "m/s", -2.0, 2.0)  # margins 1 m and 1 m/s
+INSIDE = (1.0, 0.0)
+
+
+class Clock:
+    """A clock that moves on by `takes` s whenever a model was asked."""
+
+    def __init__(self) -> None:
+        self.now = self.takes = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def watch_of(
+    model: Callable[[Sequence[float]], Sequence[float]],
+    clock: Clock | None = None,
+    limits: GuardLimits = LIMITS,
+) -> Watch:
+    clock = clock or Clock()
+
+    def asked(features: Sequence[float]) -> Sequence[float]:
+        clock.now += clock.takes
+        return model(features)
+
+    return Watch(asked, (Z, VX), limits, clock=clock)
+
+
+def constant(*answer: float) -> Callable[[Sequence[float]], Sequence[float]]:
+    return lambda features: answer
+
+
+def test_a_watch_begins_untripped_without_trust_and_without_a_name() -> None:
+    watch = Watch(constant(0.0, 0.0, 0.0), (Z, VX))
+    assert (watch.tripped, watch.reason, watch.trust, watch.inference_time) == (False, "", 0.0, 0.0)
+    assert (watch.name, watch.wants_yaw, watch.actuation) == ("", False, ACTS_AT_ONCE)
+    assert watch.limits == GuardLimits()
+    slow = Actuation(rate_lag=0.04)
+    told = Watch(constant(0.0, 0.0, 0.0), (Z, VX), LIMITS, True, "abc", actuation=slow)
+    assert (told.limits, told.wants_yaw, told.name, told.actuation) == (LIMITS, True, "abc", slow)
+
+
+def test_tilt_is_corrected_for_when_it_acts_thrust_for_when_that_acts_and_the_rate_is_in_between() -> None:
+    watch = watch_of(lambda features: (features[1], 3.0 * features[1] ** 2, features[0]))
+    look = watch.look([(1.0, 0.5), (1.5, 0.75), (2.0, -1.0)], 0.125, 0.01)
+    assert look.raw == look.wanted == (0.5, 0.75, 2.0)
+    assert look.rate == ((0.75 - 0.5) / 0.125, (3.0 * 0.75**2 - 0.75) / 0.125)
+
+
+def test_what_a_model_says_is_cut_for_acting_and_told_whole_for_the_record() -> None:
+    look = watch_of(constant(-5.0, 5.0, -9.0)).look([INSIDE] * 3, 0.02, 0.01)
+    assert look.raw == (-5.0, 5.0, -9.0)
+    assert look.wanted == (-2.0, 4.0, -8.0)
+    assert look.rate == (0.0, 0.0)
+
+
+def test_each_moment_is_trusted_by_its_own_features_and_the_worst_of_them_is_told() -> None:
+    watch = watch_of(constant(1.0, 2.0, 4.0))
+    look = watch.look([(4.25, 0.0), (1.0, 0.0), (4.5, 2.75)], 0.5, 0.01)
+    assert look.wanted == (0.75, 1.5, 1.0)
+    assert look.rate == ((1.0 - 0.75) / 0.5, (2.0 - 1.5) / 0.5)
+    assert watch.trust == 0.25
+    assert watch.evaluate(INSIDE, 0.01) == ((1.0, 2.0, 4.0), (1.0, 2.0, 4.0))
+    assert watch.trust == 1.0
+
+
+@pytest.mark.parametrize(
+    ("features", "trust"),
+    [
+        ((0.0, 0.0), 1.0),  # on the edge
+        ((4.0, 2.0), 1.0),
+        ((-0.25, 0.0), 0.75),
+        ((4.25, 0.0), 0.75),
+        ((4.25, -2.5), 0.5),  # two outside: the worse one, in either order
+        ((-0.5, 2.25), 0.5),
+        ((5.0, 0.0), 0.0),
+        ((50.0, 0.0), 0.0),
+        ((math.nan, 0.0), 0.0),
+        ((0.0, math.inf), 0.0),
+    ],
+)
+def test_trust_falls_from_the_edge_of_the_training_range_across_the_margin(features, trust: float) -> None:
+    watch = watch_of(constant(1.0, 1.0, 1.0))
+    assert watch.evaluate(features, 0.01)[1] == (trust, trust, trust)
+    assert watch.trust == trust
+
+
+@pytest.mark.parametrize(
+    ("one", "margin"),
+    [
+        (Range("z", "m", 1.0, 9.0), 2.0),  # a quarter of the range's width
+        (Range("z", "m", 1.0, 1.0), 0.2),
+        (Range("vx", "m/s", 1.0, 1.0), 0.5),
+        (Range("u_batt", "V", 16.0, 16.0), 0.5),
+        (Range("cos_phi", "1", 1.0, 1.0), 0.1),
+        (Range("T", "N", -8.0, -8.0), 0.8),  # a tenth of what it was, whichever its sign
+        (Range("T", "N", -8.0, -7.5), 0.8),
+        (Range("T", "N", -2.0, 5.0), 1.75),
+        (Range("T", "N", -2.0, 2.0), 1.0),
+        (Range("T", "N", 4.0, 5.0), 0.5),
+        (Range("T", "N", 0.0, 0.0), 1e-7),
+    ],
+)
+def test_the_margin_is_a_share_of_the_range_and_never_less_than_noise_and_trim_of_its_unit(
+    one: Range, margin: float
+) -> None:
+    for value in (one.low - 0.5 * margin, one.high + 0.5 * margin):
+        watch = Watch(constant(1.0, 1.0, 1.0), (one,))
+        assert watch.evaluate((value,), 0.01)[1][0] == pytest.approx(0.5)
+
+
+def test_features_beyond_the_model_s_own_are_left_out() -> None:
+    got = []
+    watch = watch_of(lambda features: got.append(tuple(features)) or (0.0, 0.0, 0.0))
+    watch.evaluate((1.0, 0.5, 7.0), 0.01)
+    assert got == [(1.0, 0.5)]
+    assert not watch.tripped
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_up_to_its_authority_a_model_may_stay_and_beyond_it_for_the_patience_only(
+    axis: int, sign: float
+) -> None:
+    authority = LIMITS.authority[axis]
+
+    def asking(share: float) -> Callable[[Sequence[float]], Sequence[float]]:
+        return constant(*(sign * share * authority if i == axis else 0.0 for i in range(3)))
+
+    content = watch_of(asking(1.0))
+    for _ in range(20):
+        content.evaluate(INSIDE, 0.25)
+    assert not content.tripped
+
+    greedy = watch_of(asking(1.5))
+    for _ in range(4):
+        greedy.evaluate(INSIDE, 0.25)
+    assert not greedy.tripped, "at the patience, not yet beyond it"
+    raw, wanted = greedy.evaluate(INSIDE, 0.25)
+    assert greedy.reason == "beyond its authority for 1 s"
+    assert (raw[axis], wanted, greedy.trust) == (sign * 1.5 * authority, ZERO, 0.0)
+
+    wild = watch_of(asking(4.0))
+    wild.evaluate(INSIDE, 0.25)
+    assert not wild.tripped, "at four times its authority, not yet beyond it"
+    absurd = watch_of(asking(5.0))
+    absurd.evaluate(INSIDE, 0.0)
+    assert absurd.reason == "a correction 5 times its authority"
+
+
+def test_the_patience_begins_anew_after_one_answer_within_the_authority_or_the_range() -> None:
+    answer = [3.0]
+    watch = watch_of(lambda features: (answer[0], 0.0, 0.0))
+    for asked, features in [(3.0, INSIDE)] * 4 + [(0.0, INSIDE)] + [(0.0, (9.0, 0.0))] * 4 + [(0.0, INSIDE)]:
+        answer[0] = asked
+        watch.evaluate(features, 0.25)
+        assert not watch.tripped
+    for asked, features in [(3.0, INSIDE)] * 4 + [(0.0, INSIDE)] + [(0.0, (0.0, 9.0))] * 4:
+        answer[0] = asked
+        watch.evaluate(features, 0.25)
+        assert not watch.tripped
+    watch.evaluate((0.0, 9.0), 0.25)
+    assert watch.reason == "vx outside its training range for 1 s"
+
+
+def test_of_two_features_that_are_outside_alike_the_first_is_told() -> None:
+    watch = watch_of(constant(0.0, 0.0, 0.0))
+    for _ in range(5):
+        watch.evaluate((5.0, 3.0), 0.25)  # both just where nothing is believed any more
+    assert watch.reason == "z outside its training range for 1 s"
+
+
+def test_fewer_features_than_the_model_knows_are_a_mistake_of_ours() -> None:
+    with pytest.raises(ValueError, match="shorter"):
+        watch_of(constant(0.0, 0.0, 0.0)).evaluate((1.0,), 0.01)
+
+
+def test_an_answer_in_time_is_one_within_the_deadline_and_some_late_ones_in_a_row_trip() -> None:
+    clock = Clock()
+    watch = watch_of(constant(1.0, 0.0, 0.0), clock)
+    clock.takes = LIMITS.deadline
+    for _ in range(10):
+        watch.evaluate(INSIDE, 0.01)
+    assert not watch.tripped, "at the deadline is in time"
+    for _ in range(5):
+        clock.takes = 2.0 * LIMITS.deadline
+        for _ in range(LIMITS.misses - 1):
+            watch.evaluate(INSIDE, 0.01)
+        clock.takes = 0.0
+        watch.evaluate(INSIDE, 0.01)
+        assert not watch.tripped, "not in a row"
+    clock.takes = 2.0 * LIMITS.deadline
+    fresh = watch_of(constant(1.0, 0.0, 0.0), clock)
+    for _ in range(LIMITS.misses):
+        assert not (watch.tripped or fresh.tripped)
+        fresh.evaluate(INSIDE, 0.01)
+        raw, wanted = watch.evaluate(INSIDE, 0.01)
+        assert watch.inference_time == 0.5
+    assert watch.reason == fresh.reason == "inference took 500.0 ms"
+    assert (raw, wanted) == ((1.0, 0.0, 0.0), ZERO)
+
+
+def test_a_single_answer_beyond_the_stall_trips_and_three_moments_are_one_inference() -> None:
+    clock = Clock()
+    clock.takes = LIMITS.stall
+    at_the_stall = watch_of(constant(1.0, 0.0, 0.0), clock)
+    at_the_stall.evaluate(INSIDE, 0.01)
+    assert not at_the_stall.tripped
+    clock.takes = 0.5
+    watch = watch_of(constant(1.0, 0.0, 0.0), clock)
+    watch.look([INSIDE] * 3, 0.02, 0.01)
+    assert watch.inference_time == 1.5
+    assert watch.reason == "inference took 1500.0 ms"
+
+
+@pytest.mark.parametrize("nonsense", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("moment", range(3))
+def test_a_number_that_is_not_finite_anywhere_leaves_nothing_of_all(nonsense, axis: int, moment: int) -> None:
+    asked = []
+
+    def model(features: Sequence[float]) -> Sequence[float]:
+        asked.append(features)
+        bad = len(asked) - 1 == moment
+        return tuple(nonsense if bad and i == axis else 1.0 for i in range(3))
+
+    watch = watch_of(model)
+    assert watch.look([INSIDE] * 3, 0.02, 0.01) == (ZERO, ZERO, (0.0, 0.0))
+    assert watch.reason == "the model returned a number that is not finite"
+    assert watch.tripped
+
+
+def test_after_a_trip_the_model_is_not_asked_again_and_nothing_is_wanted() -> None:
+    clock, asked = Clock(), []
+
+    def model(features: Sequence[float]) -> Sequence[float]:
+        asked.append(features)
+        raise LookupError
+
+    clock.takes = 0.125
+    watch = watch_of(model, clock)
+    assert watch.evaluate(INSIDE, 0.01) == (ZERO, ZERO)
+    assert watch.reason == "the model raised LookupError"
+    assert watch.look([INSIDE] * 3, 0.02, 0.01) == (ZERO, ZERO, (0.0, 0.0))
+    assert len(asked) == 1
+    assert watch.inference_time == 0.0
+
+
+def test_a_model_that_takes_rows_is_asked_once_for_the_three_moments() -> None:
+    class Rows:
+        asked = 0
+
+        def __call__(self, features: Sequence[float]) -> Sequence[float]:
+            raise AssertionError("asked one by one")
+
+        def rows(self, rows: Sequence[Sequence[float]]) -> Sequence[Sequence[float]]:
+            self.asked += 1
+            return [(features[1], 0.0, 0.0) for features in rows]
+
+    model = Rows()
+    watch = Watch(model, (Z, VX), LIMITS)
+    assert watch.look([(1.0, 0.5), (1.0, 1.0), INSIDE], 0.25, 0.01).rate == (2.0, 0.0)
+    assert model.asked == 1
+
+
+@pytest.mark.parametrize("answers", [2, 4])
+def test_a_model_that_answers_for_more_or_fewer_moments_than_asked_trips(answers: int) -> None:
+    class Miscounting:
+        def __call__(self, features: Sequence[float]) -> Sequence[float]:
+            raise AssertionError("asked one by one")
+
+        def rows(self, rows: Sequence[Sequence[float]]) -> Sequence[Sequence[float]]:
+            return [(1.0, 0.0, 0.0)] * answers
+
+    watch = Watch(Miscounting(), (Z, VX), LIMITS)
+    assert watch.look([INSIDE] * 3, 0.02, 0.01) == (ZERO, ZERO, (0.0, 0.0))
+    assert watch.reason == "the model raised ValueError"
