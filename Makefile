@@ -6,7 +6,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 SEED ?= 7
 
-.PHONY: setup demo test lint wheel-test bench faults clean
+.PHONY: setup demo test lint coverage mutation wheel-test bench faults clean
 
 setup: $(VENV)/.installed
 
@@ -35,6 +35,18 @@ lint: setup
 wheel-test: setup
 	$(BIN)/python tests/packaging/install.py
 
+# Every branch of the control law, by tests in one process; below 100 % it fails.
+LAW := $(addprefix tests/companion/test_,watch.py guard.py succession.py control.py controllers.py inference.py model_files.py)
+
+coverage: setup
+	mkdir -p build
+	$(BIN)/pytest $(LAW) --cov --cov-report=term
+
+# What the tests of guard, watch and the reasons to stop would let pass: docs/mutation.md
+mutation: setup
+	nice -n 10 $(BIN)/mutmut run --max-children 2
+	$(BIN)/mutmut results
+
 bench: setup
 	for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
@@ -45,4 +57,4 @@ faults: setup
 	$(BIN)/python tests/faults/campaign.py --scale $(SCALE) $(FAULTS)
 
 clean:
-	rm -rf $(VENV) out build *.egg-info
+	rm -rf $(VENV) out build mutants *.egg-info

@@ -335,6 +335,29 @@ def replace_position(state: State, position: tuple[float, float, float]) -> Stat
     return state._replace(position=position)
 
 
+def test_what_the_trim_has_learned_stays_when_the_mission_is_over_and_grows_no_more() -> None:
+    controller, still = (
+        Corrected(LAW, Oracle(), TrimLimits()),
+        ReferenceSample((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0),
+    )
+    home = State((0.0, 0.0, 1.0), ZERO, (1.0, 0.0, 0.0, 0.0), 1.0, 16.0)
+    aside = replace_position(home, (0.2, 0.0, 1.0))
+    controller.start()
+    controller.step(home, lambda ahead: still, DT)
+    for _ in range(150):
+        learned = controller.step(aside, lambda ahead: still, DT).trim
+    controller.stop()
+    for _ in range(50):
+        step = controller.step(aside, lambda ahead: still, DT)
+        assert step.trim == learned
+    assert learned[0] > 0.0
+
+
+def test_a_mission_chooses_its_controller_by_name() -> None:
+    made = [make_controller(name, LAW, Oracle()) for name in ("lqr", "lqr_integral", "corrected")]
+    assert [type(one) for one in made] == [Lqr, LqrIntegral, Corrected]
+
+
 def test_controllers_that_lack_something_are_refused() -> None:
     with pytest.raises(InputError, match="needs a deployed model"):
         make_controller("corrected", LAW)

@@ -184,7 +184,7 @@ def test_of_two_features_that_are_outside_alike_the_first_is_told() -> None:
 
 
 def test_fewer_features_than_the_model_knows_are_a_mistake_of_ours() -> None:
-    with pytest.raises(ValueError, match="shorter"):
+    with pytest.raises(ValueError, match="longer"):
         watch_of(constant(0.0, 0.0, 0.0)).evaluate((1.0,), 0.01)
 
 
