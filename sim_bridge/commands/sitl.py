@@ -54,7 +54,7 @@ def sitl(
     """
     settings = settings_of(owner, wanted, draw, free_speed=speed, duration=duration)
     believed = load_vehicle(settings.vehicle)
-    from trueflight.sim_bridge.sitl.lockstep import Position
+    from trueflight.sim_bridge.sitl.messages import Position
     from trueflight.sim_bridge.sitl.session import Request, fly, parameter_lines
     from trueflight.sim_bridge.truth.hidden import choose
     from trueflight.sim_bridge.world import check_vehicle

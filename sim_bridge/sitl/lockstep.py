@@ -8,7 +8,6 @@ on it answers each HIL_SENSOR with one HIL_ACTUATOR_CONTROLS of the same time, a
 from __future__ import annotations
 
 import errno
-import math
 import select
 import socket
 import time
@@ -21,28 +20,13 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mav
 
 from trueflight.models.errors import InputError
-from trueflight.sim_bridge.mavlink import wire
 from trueflight.sim_bridge.mavlink.stream import MessageStream
-from trueflight.sim_bridge.simulator import Moment, Simulator
-from trueflight.sim_bridge.sitl.sensors import (
-    FORCE_STEP,
-    RATE_STEP,
-    RawSensors,
-    pressure_altitude,
-    rounded_by_px4,
-)
-from trueflight.sim_bridge.world import PHYSICS_STEP
+from trueflight.sim_bridge.simulator import Simulator
+from trueflight.sim_bridge.sitl.messages import SENSOR_PERIOD, SENSOR_STEPS, Offer, SensorMessages
+from trueflight.sim_bridge.sitl.sensors import RawSensors
 
-SENSOR_STEPS = 2
-"""Physics steps between two HIL_SENSOR messages: 250 Hz, PX4's IMU_INTEG_RATE in simulation."""
-
-SENSOR_PERIOD = SENSOR_STEPS * PHYSICS_STEP
 _PERIOD_US = round(SENSOR_PERIOD * 1e6)
 
-# Bits of HIL_SENSOR.fields_updated.
-_IMU_FIELDS, _MAGNETOMETER_FIELDS, _BAROMETER_FIELDS = 0x3F, 0x1C0, 0x1A00
-_MAGNETOMETER_EVERY, _BAROMETER_EVERY, _GPS_EVERY = 4, 5, 25  # HIL_SENSOR messages: 62.5, 50 and 10 Hz
-_TRUTH_EVERY = 2  # 125 Hz
 _HOUSEKEEPING_EVERY = 25
 
 _ARMED, _LOCKSTEP = 128, 1  # bits of HIL_ACTUATOR_CONTROLS.mode and .flags
@@ -57,29 +41,12 @@ _PARKED = 4  # further connections that are kept waiting
 Tell = Callable[[str], None]
 
 
-class Position(Enum):
-    """What tells PX4 where it is."""
-
-    GPS = "gps"
-    VISION = "vision"
-    BOTH = "both"
-
-
 class Ending(Enum):
     """Why a flight with PX4 ended."""
 
     STOPPED = "stopped"
     CLOSED = "PX4 closed the connection"
     SILENT = "PX4 fell silent"
-
-
-@dataclass(frozen=True)
-class Offer:
-    """What PX4 is given: the source of its position, the rate of vision (Hz), and how late vision and GPS are (s)."""
-
-    position: Position = Position.GPS
-    vision_rate: float = 50.0
-    delay: float = 0.0
 
 
 @dataclass
@@ -138,8 +105,6 @@ class Lockstep:
         offer: Offer | None = None,
     ) -> None:
         self.simulator = simulator
-        self.sensors = sensors
-        self.offer = Offer() if offer is None else offer
         self.speed = speed
         self.progress = Progress()
         self.peer = ""
@@ -148,7 +113,6 @@ class Lockstep:
         self._client: socket.socket | None = None
         self._parked: list[socket.socket] = []
         self._stream = MessageStream()
-        self._link = mav.MAVLink(None, srcSystem=1, srcComponent=200)
         self._motors = (0.0, 0.0, 0.0, 0.0)
         self._in_step = False  # from PX4's first motor commands on
         self._answered_us = self._sent_us = 0
@@ -156,10 +120,7 @@ class Lockstep:
         self._ticks = 0
         self._start_us = simulator.time_us
         self._now = self._before = simulator.moment()
-        late = round(self.offer.delay / SENSOR_PERIOD)
-        self._past: list[Moment] = [self._now] * (late + 1)
-        self._vision_every = max(round(1.0 / (self.offer.vision_rate * SENSOR_PERIOD)), 1)
-        self._utc_us = time.time_ns() // 1000
+        self._messages = SensorMessages(sensors, Offer() if offer is None else offer, self._now)
         self._foreign_told = False
 
     def close(self) -> None:
@@ -260,45 +221,13 @@ class Lockstep:
             else:
                 simulator.rest()
             self._before, self._now = self._now, simulator.moment()
-        self._past = [*self._past[1:], self._now]
         self._ticks += 1
 
     def _send_sensors(self) -> None:
         """What the sensors say now, as one write."""
-        sensors, now, tick = self.sensors, self._now, self._ticks
         time_us = self.simulator.time_us + _PERIOD_US  # PX4's clock must not begin at 0
-        imu = sensors.imu(self._before, now)
-        fields = _IMU_FIELDS
-        field_x = field_y = field_z = hectopascal = altitude = 0.0
-        if tick % _MAGNETOMETER_EVERY == 0:
-            fields |= _MAGNETOMETER_FIELDS
-            field_x, field_y, field_z = sensors.magnetometer(now)
-        if tick % _BAROMETER_EVERY == 0:
-            fields |= _BAROMETER_FIELDS
-            hectopascal = sensors.barometer(now)
-            altitude = pressure_altitude(hectopascal)
-        force = rounded_by_px4(imu.specific_force, FORCE_STEP)
-        rates = rounded_by_px4(imu.body_rate, RATE_STEP)
-        messages = [
-            mav.MAVLink_hil_sensor_message(
-                *(time_us, *force, *rates, field_x, field_y, field_z),
-                *(hectopascal, 0.0, altitude, 20.0, fields, 0),
-            )
-        ]
-        if self.offer.position is not Position.VISION and tick % _GPS_EVERY == 0:
-            messages.append(self._gps(time_us))
-        if self.offer.position is not Position.GPS and tick % self._vision_every == 0:
-            messages.append(self._vision(time_us))
-        if tick % _TRUTH_EVERY == 0:
-            messages.append(self._truth(time_us))
-        data = b"".join(self._pack(message) for message in messages)
         self._sent_us = time_us
-        self._write(data)
-
-    def _pack(self, message: Any) -> bytes:
-        packed: bytes = message.pack(self._link)
-        self._link.seq = (self._link.seq + 1) % 256
-        return packed
+        self._write(self._messages.of(self._ticks, time_us, self._before, self._now))
 
     def _write(self, data: bytes) -> None:
         assert self._client is not None
@@ -310,63 +239,6 @@ class Lockstep:
                 if time.monotonic() > deadline:
                     raise ConnectionError("PX4 reads no more") from None
                 select.select((), [self._client], (), 0.1)
-
-    def _gps(self, time_us: int) -> Any:
-        gps = self.sensors.gps(self._past[0])
-        north, east, down = gps.velocity
-        ground = math.hypot(north, east)
-        return mav.MAVLink_hil_gps_message(
-            self._utc_us + time_us,
-            mav.GPS_FIX_TYPE_3D_FIX,
-            *(round(gps.latitude * 1e7), round(gps.longitude * 1e7), round(gps.altitude * 1e3)),
-            *(50, 80, round(ground * 100)),
-            *(round(north * 100), round(east * 100), round(down * 100)),
-            round(math.degrees(math.atan2(east, north)) % 360.0 * 100) % 36000,
-            16,
-        )
-
-    def _vision(self, time_us: int) -> Any:
-        seen = self.sensors.vision(self._past[0])
-        noise = self.sensors.noise
-        # Upper triangles of 6 x 6 by rows: the diagonal is at 0, 6, 11, 15, 18, 20.
-        pose, twist = [0.0] * 21, [0.0] * 21
-        pose[0] = pose[6] = pose[11] = max(noise.vision_position, 0.001) ** 2
-        pose[15] = pose[18] = pose[20] = max(noise.vision_attitude, 0.001) ** 2
-        twist[0] = twist[6] = twist[11] = max(noise.vision_velocity, 0.001) ** 2
-        nan = math.nan
-        return mav.MAVLink_odometry_message(
-            time_us,
-            mav.MAV_FRAME_LOCAL_NED,
-            mav.MAV_FRAME_LOCAL_NED,
-            *seen.position,
-            seen.quaternion,
-            *seen.velocity,
-            *(nan, nan, nan),
-            pose,
-            twist,
-            0,
-            mav.MAV_ESTIMATOR_TYPE_VISION,
-            100,
-        )
-
-    def _truth(self, time_us: int) -> Any:
-        """The ground truth for PX4's own log."""
-        _, position, velocity, acceleration, _, _, _ = self._now
-        x, y, z, w, a, b, c = position
-        latitude, longitude, altitude = wire.geodetic((x, y, z))
-        vx, vy, vz, p, q, r = velocity
-        north, east, down = wire.ned((vx, vy, vz))
-        ax, ay, az = wire.ned(acceleration)
-        speed = round(math.sqrt(vx * vx + vy * vy + vz * vz) * 100)
-        return mav.MAVLink_hil_state_quaternion_message(
-            time_us,
-            wire.attitude((w, a, b, c)),
-            *(p, -q, -r),
-            *(round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3)),
-            *(_int16(north * 100), _int16(east * 100), _int16(down * 100)),
-            *(min(speed, 65535), min(speed, 65535)),
-            *(_int16(ax / 9.80665e-3), _int16(ay / 9.80665e-3), _int16(az / 9.80665e-3)),
-        )
 
     def _take_controls(self) -> bool:
         """Take PX4's motor commands for this step; False when it has been silent for too long."""
@@ -439,7 +311,3 @@ class Lockstep:
         if self._stream.foreign > _GARBAGE and not self._foreign_told:
             self._foreign_told = True
             self._tell(f"{self._stream.foreign} bytes from PX4's connection were no MAVLink and are skipped")
-
-
-def _int16(value: float) -> int:
-    return min(max(round(value), -32768), 32767)

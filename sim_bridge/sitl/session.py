@@ -24,7 +24,8 @@ from trueflight.sim_bridge.sitl.check import (
     AllocationCheck,
     State,
 )
-from trueflight.sim_bridge.sitl.lockstep import Ending, Lockstep, Offer, Position, Progress, listen
+from trueflight.sim_bridge.sitl.lockstep import Ending, Lockstep, Progress, listen
+from trueflight.sim_bridge.sitl.messages import Offer, Position
 from trueflight.sim_bridge.sitl.px4_link import PAYLOAD_PORT, Px4Link
 from trueflight.sim_bridge.sitl.sensors import RawNoise, RawSensors
 from trueflight.sim_bridge.sitl.truth_table import TruthTable
