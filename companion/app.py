@@ -9,6 +9,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import zenoh
+
+from trueflight.companion.deployment import Deployment
 from trueflight.companion.director import Director
 from trueflight.companion.flight import FlightStateMachine
 from trueflight.companion.law.control import ControlLaw
@@ -16,16 +19,18 @@ from trueflight.companion.mission_request import SMALL, read_json, read_request
 from trueflight.companion.odometry import Odometry
 from trueflight.companion.outcome import IDLE
 from trueflight.companion.pose import PoseFeed
+from trueflight.companion.readiness import Readiness
+from trueflight.companion.records import Records
 from trueflight.companion.settings import Settings
 from trueflight.companion.signature import Signatures
 from trueflight.companion.store import ModelStore
-from trueflight.companion.telemetry import ATTACHED, Telemetry, make_event
+from trueflight.companion.telemetry import ATTACHED, Handler, Telemetry, make_event
 from trueflight.companion.tick import make_tick
 from trueflight.companion.vehicle_link import VehicleLink
 from trueflight.companion.watchdog import Watchdog, raise_priority
 from trueflight.companion.zenoh_session import INSECURE, open_planned, plan_session
 from trueflight.models.contract import model_hash
-from trueflight.models.design import load_design
+from trueflight.models.design import Design, load_design
 from trueflight.models.errors import InputError, shown
 from trueflight.models.vehicle import load_vehicle
 
@@ -47,6 +52,13 @@ def _return_memory() -> None:
         return
 
 
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot make the folder ({error.strerror})") from None
+
+
 class Companion:
     """Everything of one run of the companion.
 
@@ -59,18 +71,13 @@ class Companion:
         vehicle = load_vehicle(settings.vehicle)
         design = load_design(settings.design_path, vehicle)
         law = ControlLaw(vehicle, design, settings.limits)
-        records = Path(settings.records)
-        for folder in (records, Path(settings.models)):
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise InputError(f"{folder}: cannot make the folder ({error.strerror})") from None
+        records, models = Path(settings.records), Path(settings.models)
+        for folder in (records, models):
+            _make(folder)
         keys = settings.own_keys()
         plan = plan_session(settings.zenoh, keys, vehicle.name)
-        signatures = Signatures(
-            Path(settings.models), vehicle.name, keys, settings.unsigned_models, bool(plan.exposed)
-        )
-        store = ModelStore(Path(settings.models), vehicle, settings.guard.deadline, signatures.stored)
+        signatures = Signatures(models, vehicle.name, keys, settings.unsigned_models, bool(plan.exposed))
+        store = ModelStore(models, vehicle, settings.guard.deadline, signatures.stored)
         signatures.sweep()
         session = open_planned(plan)
         try:
@@ -85,52 +92,62 @@ class Companion:
             "loose": plan.loose,
             "listen": list(plan.listen),
         }
-        self.flight = FlightStateMachine(law, settings.safety, self.emit, settings.trim, settings.agreement)
-        self.director = Director(
-            self.link,
-            self.flight,
-            vehicle,
-            design,
-            store,
-            settings.safety,
-            settings.guard,
-            settings.shadow,
-            records,
-            settings.rate,
-            self.emit,
-            require_record=settings.require_record,
-        )
-        self._vehicle_time_us = 0
-        self._errors_told = 0
-        self._told_by_autopilot = ""
         self.watchdog = Watchdog()
         self._priority = settings.realtime
-        self.telemetry = Telemetry(
-            session,
-            vehicle.name,
-            {
-                "status": lambda payload, parameters: self._status(),
-                "mission": lambda payload, parameters: self.director.request(read_request(payload)),
-                "model": self._model,
-            },
-            records,
+        self._vehicle_time_us = self._errors_told = 0
+        self._told_by_autopilot = ""
+        self.vehicle, self.flight = (
+            vehicle,
+            FlightStateMachine(law, settings.safety, self.emit, settings.trim, settings.agreement),
         )
-        self.pose: PoseFeed | None = None
-        if settings.pose.enabled:
-            self.pose = PoseFeed(settings.pose, self.link.send_pose, self.emit)
-            self.director.pose = self.pose
-            self.link.share_clock()
-            self.telemetry.subscribe("pose", self.pose.take, self.pose.refuse_size)
+        self._direct(settings, design, store)
+        self._open(session, settings, records)
         if plan.exposed:
             self.emit("error", "insecure", f"{INSECURE}; it {' and '.join(plan.exposed)}")
         for reason in store.refused_at_start:
             self.emit("warning", "model_refused", f"no longer accepted: {reason}")
+        self._listen(settings.rate)
+
+    def _direct(self, settings: Settings, design: Design, store: ModelStore) -> None:
+        """What flies missions and brings models into flights."""
+        link, flight, vehicle, safety, rate = (
+            self.link,
+            self.flight,
+            self.vehicle,
+            settings.safety,
+            settings.rate,
+        )
+        self.records = Records(
+            Path(settings.records), vehicle, design, rate, settings.require_record, self.emit
+        )
+        self.readiness = Readiness(link, flight, self.records, safety, vehicle, rate)
+        self.deployment = Deployment(store, flight, settings.guard, settings.shadow, self.emit)
+        self.director = Director(
+            link, flight, self.records, self.readiness, self.deployment, safety, vehicle.name, self.emit
+        )
+
+    def _open(self, session: zenoh.Session, settings: Settings, records: Path) -> None:
+        """The ground's end, and that of mocap poses where they are on."""
+        handlers: dict[str, Handler] = {
+            "status": lambda payload, parameters: self._status(),
+            "mission": lambda payload, parameters: self.director.request(read_request(payload)),
+            "model": self._model,
+        }
+        self.telemetry = Telemetry(session, self.vehicle.name, handlers, records)
+        self.pose: PoseFeed | None = None
+        if settings.pose.enabled:
+            self.pose = self.readiness.pose = PoseFeed(settings.pose, self.link.send_pose, self.emit)
+            self.link.share_clock()
+            self.telemetry.subscribe("pose", self.pose.take, self.pose.refuse_size)
+
+    def _listen(self, rate: float) -> None:
+        """Answer to what the vehicle tells from here on."""
         self.link.on_odometry = self._control
         self.link.on_error = self._wire_error
         self.link.on_blind = self.watchdog.tick  # nothing to control by, but the control thread is well
         self.link.on_notice = self._autopilot_tells
         try:
-            self._settle_rates(settings.rate)
+            self._settle_rates(rate)
         except InputError:
             self.close()
             raise
@@ -163,7 +180,7 @@ class Companion:
         """Tell an event to the ground and to the record; any thread, never blocks."""
         event = make_event(level, kind, text, self._vehicle_time_us)
         self.telemetry.event(event)
-        self.director.records.event(event)
+        self.records.event(event)
 
     def _control(self, odometry: Odometry) -> None:
         """The control loop: one odometry message in, at most one setpoint out, then the book-keeping."""
@@ -181,7 +198,7 @@ class Companion:
         self.flight.watch(latest)
         self._vehicle_time_us = odometry.vehicle_time_us
         data = make_tick(odometry, latest, outcome, latency).SerializeToString()
-        self.director.records.tick(data, odometry.vehicle_time_us, odometry.host_time_ns)
+        self.records.tick(data, odometry.vehicle_time_us, odometry.host_time_ns)
         self.telemetry.tick(data)
         self.watchdog.tick()
 
@@ -233,16 +250,16 @@ class Companion:
                 self.emit("info", "model_signed", f"{name}: {self._signatures.told(name)}")
             shadow = parameters.get("shadow")
             try:
-                return self.director.deploy(payload, float(shadow) if shadow is not None else None)
+                return self.deployment.deploy(payload, float(shadow) if shadow is not None else None)
             except ValueError:
                 return {"accepted": False, "reason": f"shadow = {shown(shadow)} is not a number of seconds"}
         if len(payload) > SMALL:
             raise InputError("no ONNX file, and too long for a command; send list, rollback or an ONNX file")
         command = read_json(payload).get("command")
         if command == "list":
-            return {"accepted": True, "reason": "", **self.director.store.describe()}
+            return {"accepted": True, "reason": "", **self.deployment.store.describe()}
         if command == "rollback":
-            return self.director.roll_back()
+            return self.deployment.roll_back()
         return {
             "accepted": False,
             "reason": f"unknown command {shown(command)}; send list, rollback or an ONNX file",
@@ -252,8 +269,8 @@ class Companion:
         """Ask for rates until they arrive; an autopilot that has just started takes a moment."""
         for _ in range(_RATE_TRIES):
             self.link.request_rates(rate)
-            self.director.rates = self.link.measure(1.0)
-            reason = self.director.rates_too_low(self.director.rates)
+            self.readiness.rates = self.link.measure(1.0)
+            reason = self.readiness.rates_too_low(self.readiness.rates)
             if not reason:
                 return
         raise InputError(f"{self.link.address}: {reason}")

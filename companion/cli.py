@@ -124,14 +124,14 @@ def run(
 
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
-    rates = companion.director.rates
+    rates = companion.readiness.rates
     assert rates is not None
     if companion.access["exposed"]:
         from rich.console import Console
 
         Console(stderr=True).print(f"[bold red]{INSECURE}[/]; it {' and '.join(companion.access['exposed'])}")
     where = ", ".join(companion.access["listen"]) or "Zenoh"
-    ready = f"{companion.director.vehicle.name} at {rates.odometry:.0f} Hz on {settings.connect}, missions on {where}"
+    ready = f"{companion.vehicle.name} at {rates.odometry:.0f} Hz on {settings.connect}, missions on {where}"
     typer.echo(f"ready: {ready}")
     sys.stdout.flush()
     companion.watchdog.ready(ready)

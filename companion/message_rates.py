@@ -26,6 +26,10 @@ class Rates:
     duration: float
     mode: float = math.inf
 
+    def describe(self) -> dict[str, float]:
+        """For the status."""
+        return {"odometry": round(self.odometry, 1), "imu": round(self.imu, 1)}
+
 
 def odometry_too_low(rates: Rates, wanted: float, share: float = 0.75) -> str:
     """'' where odometry arrives at `share` of what is `wanted` (Hz) at least, otherwise what to set."""

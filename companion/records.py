@@ -23,15 +23,22 @@ _AROUND = 60.0
 
 
 class Records:
-    """The folder of the flight records; one is written at a time.
+    """The folder of the flight records of a vehicle and its design; one is written at a time.
 
     `emit(level, kind, text)` must not block. `rate` is the ticks a second. `required`: whether a flight may only begin
     with a record. A flight under way is never ended by its record: what is lost is told at once.
     """
 
     def __init__(
-        self, folder: Path, rate: float, required: bool, emit: Callable[[str, str, str], None]
+        self,
+        folder: Path,
+        vehicle: Vehicle,
+        design: Design,
+        rate: float,
+        required: bool,
+        emit: Callable[[str, str, str], None],
     ) -> None:
+        self._vehicle, self._design = vehicle, design
         self.folder, self.recorder = folder, None
         self._rate, self._required, self._emit = rate, required, emit
         self._told = ""
@@ -49,14 +56,11 @@ class Records:
         """'' where a flight with a mission of so many s may begin, otherwise what is wrong with its record."""
         return self._no_room(seconds) if self._required else ""
 
-    def begin(
-        self,
-        mission: Mission,
-        model: str,
-        vehicle: Vehicle,
-        design: Design,
-    ) -> tuple[str, str]:
-        """Begin the record of a mission: its name, and why the flight may not begin without one."""
+    def begin(self, mission: Mission, model: str) -> tuple[str, str]:
+        """Begin the record of a mission: its name, and why the flight may not begin without one.
+
+        `model` is the hash of the one that corrects.
+        """
         stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
         name = f"{stamp}-{mission.identity}-{mission.trajectory.name}-{mission.controller}.mcap"
         metadata = {
@@ -69,7 +73,7 @@ class Records:
         }
         self._told, self._rescued = "", False
         try:
-            self.recorder = FlightRecorder(self.folder / name, vehicle, design, metadata)
+            self.recorder = FlightRecorder(self.folder / name, self._vehicle, self._design, metadata)
             return name, ""
         except InputError as error:
             self._emit("error", "record_failed", f"{error}: this flight has no record")

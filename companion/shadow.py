@@ -81,6 +81,15 @@ class Shadow:
         """Whether it has proved itself."""
         return not self.refused and self.remaining == 0.0
 
+    def describe(self) -> dict[str, str | float]:
+        """For the status."""
+        return {
+            "hash": self.name,
+            "title": self.title,
+            "remaining": round(self.remaining, 2),
+            "refused": self.refused,
+        }
+
     @property
     def errors(self) -> tuple[Vector, Vector]:
         """RMS of measured error acceleration minus prediction, of this model and of the plain linear one (which
