@@ -96,10 +96,8 @@ class Companion:
         self._priority = settings.realtime
         self._vehicle_time_us = self._errors_told = 0
         self._told_by_autopilot = ""
-        self.vehicle, self.flight = (
-            vehicle,
-            FlightStateMachine(law, settings.safety, self.emit, settings.trim, settings.agreement),
-        )
+        self.vehicle = vehicle
+        self.flight = FlightStateMachine(law, settings.safety, self.emit, settings.trim, settings.agreement)
         self._direct(settings, design, store)
         self._open(session, settings, records)
         if plan.exposed:
@@ -110,16 +108,9 @@ class Companion:
 
     def _direct(self, settings: Settings, design: Design, store: ModelStore) -> None:
         """What flies missions and brings models into flights."""
-        link, flight, vehicle, safety, rate = (
-            self.link,
-            self.flight,
-            self.vehicle,
-            settings.safety,
-            settings.rate,
-        )
-        self.records = Records(
-            Path(settings.records), vehicle, design, rate, settings.require_record, self.emit
-        )
+        link, flight, vehicle = self.link, self.flight, self.vehicle
+        safety, rate, folder = settings.safety, settings.rate, Path(settings.records)
+        self.records = Records(folder, vehicle, design, rate, settings.require_record, self.emit)
         self.readiness = Readiness(link, flight, self.records, safety, vehicle, rate)
         self.deployment = Deployment(store, flight, settings.guard, settings.shadow, self.emit)
         self.director = Director(

@@ -1,7 +1,7 @@
 """Models on their way from the ground into flight: checked, staged, in the shadow, live, rolled back.
 
-Runs on the service thread and the main thread and may block. The control thread only ever looks at the `Succession` of a
-flight; what it decided there is put on the disk here.
+Runs on the service thread and the main thread and may block. The control thread only ever looks at the `Succession` of
+a flight; what it decided there is put on the disk here.
 """
 
 from __future__ import annotations

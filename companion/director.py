@@ -68,12 +68,8 @@ class Director:
 
     def status(self) -> dict[str, Any]:
         """What the companion is doing, for JSON."""
-        latest, flight, rates, pose = (
-            self._link.latest,
-            self._flight,
-            self._readiness.rates,
-            self._readiness.pose,
-        )
+        latest, flight = self._link.latest, self._flight
+        rates, pose = self._readiness.rates, self._readiness.pose
         candidate, not_ready = flight.models.candidate, self._readiness.why_not()
         with self._lock:
             missions = [progress.describe() for progress in self._known.values()]
