@@ -20,13 +20,12 @@ from trueflight.companion.findings import FAIL, NOTE, OK, WARN, Finding, rows_of
 from trueflight.companion.message_rates import Rates, link_too_slow, odometry_too_low
 from trueflight.companion.pose import PoseFeed
 from trueflight.companion.px4_events import ERROR
+from trueflight.companion.required_parameters import Number, RequiredParameter, required_parameters
 from trueflight.companion.settings import Settings
 from trueflight.companion.vehicle_link import VehicleLink
 from trueflight.models.errors import InputError
 from trueflight.models.record import read_record
 from trueflight.models.vehicle import Vehicle
-
-Number = int | float
 
 _SLOW, _TILT = 0.2, 0.1
 """m/s and rad below which a recorded sample counts as hover."""
@@ -68,170 +67,6 @@ class Preflight:
     def ready(self) -> bool:
         """Whether a flight may be tried."""
         return all(finding.state != FAIL for finding in self.findings)
-
-
-@dataclass(frozen=True)
-class RequiredParameter:
-    """What a parameter should be: `good` tells whether a value is, `change` makes one of what is there.
-
-    `state` is how bad it is where it is not; `otherwise` is looked at in a PX4 that does not have the parameter.
-    """
-
-    name: str
-    wanted: str
-    why: str
-    good: Callable[[Number], bool]
-    change: Callable[[Number], Number | None]
-    state: str = FAIL
-    reboot: bool = False
-    otherwise: RequiredParameter | None = None
-
-
-def required_parameters(settings: Settings) -> list[RequiredParameter]:
-    """The parameters that a flight with these settings needs, in the order of their weight.
-
-    Source: PX4's parameter reference; the first two decide what happens when the companion falls silent.
-    """
-    fence = settings.safety
-    across, up = math.ceil(1.5 * fence.fence_radius), math.ceil(1.5 * fence.fence_height)
-    out = [
-        RequiredParameter(
-            "COM_OF_LOSS_T",
-            "0.2 to 1 s",
-            "how long PX4 flies on after the companion fell silent",
-            lambda v: 0.2 <= v <= 1.0,
-            lambda v: 0.5,
-        ),
-        RequiredParameter(
-            "COM_OBL_RC_ACT",
-            "4 (Land), 3 (Return) or 5 (Hold)",
-            "what it does then; 0 to 2 need a pilot and end in a blind descent without one",
-            lambda v: v in (3, 4, 5),
-            lambda v: 4,
-        ),
-        RequiredParameter(
-            "COM_RC_OVERRIDE",
-            "bit 1 (2 or 3)",
-            "moving the sticks takes over in Offboard as well",
-            lambda v: bool(int(v) & 2),
-            lambda v: int(v) | 2,
-            WARN,
-            otherwise=RequiredParameter(
-                "MAN_OVERRIDE_SPD",
-                "0 or more",
-                "moving the sticks this fast takes over; negative: never (PX4 1.18)",
-                lambda v: v >= 0.0,
-                lambda v: 1.0,
-                WARN,
-            ),
-        ),
-        RequiredParameter(
-            "COM_RCL_EXCEPT",
-            "0 with a radio, bit 2 (4) without",
-            "bit 2: losing the radio does not end Offboard",
-            lambda v: True,
-            lambda v: None,
-            NOTE,
-        ),
-        RequiredParameter(
-            "EKF2_NOAID_TOUT",
-            "at most 1000000 us",
-            "how long PX4 1.16 and later calls a position without GPS or mocap valid, and drifts",
-            lambda v: v <= 1_000_000,
-            lambda v: 1_000_000,
-            WARN,
-        ),
-        RequiredParameter(
-            "COM_LOW_BAT_ACT",
-            "2 (Land) or 3 (Return)",
-            "what PX4 does at a critical battery; 0 only warns",
-            lambda v: v in (1, 2, 3),
-            lambda v: 2,
-            WARN,
-        ),
-        RequiredParameter(
-            "GF_MAX_HOR_DIST",
-            f"about {across:d} m",
-            f"PX4's own fence, outside the companion's {fence.fence_radius:g} m; 0 is none",
-            lambda v: fence.fence_radius < v <= 10.0 * fence.fence_radius,
-            lambda v: float(across),
-            WARN,
-        ),
-        RequiredParameter(
-            "GF_MAX_VER_DIST",
-            f"about {up:d} m",
-            f"PX4's own ceiling, above the companion's {fence.fence_height:g} m; 0 is none",
-            lambda v: fence.fence_height < v <= 10.0 * fence.fence_height,
-            lambda v: float(up),
-            WARN,
-        ),
-        RequiredParameter(
-            "GF_ACTION",
-            "2 (Hold), 3 (Return) or 5 (Land)",
-            "what PX4 does outside of it; 1 only warns",
-            lambda v: v in (2, 3, 5),
-            lambda v: 2,
-            WARN,
-        ),
-    ]
-    if settings.rate > 100.0:
-        period = int(1e6 / settings.rate)
-        out.append(
-            RequiredParameter(
-                "EKF2_PREDICT_US",
-                f"at most {period} us",
-                f"the estimator gives odometry no faster than this; {settings.rate:g} Hz are asked for",
-                lambda v: v <= period,
-                lambda v: period // 1000 * 1000 or 1000,
-                reboot=True,
-            )
-        )
-    if settings.pose.enabled:
-        out += [
-            RequiredParameter(
-                "EKF2_EV_CTRL",
-                "bits 0, 1 and 3 (11)",
-                "takes position, height and yaw from mocap or vision",
-                lambda v: int(v) & 11 == 11,
-                lambda v: int(v) | 11,
-            ),
-            RequiredParameter(
-                "EKF2_HGT_REF",
-                "3 (vision)",
-                "height is that of mocap or vision",
-                lambda v: v == 3,
-                lambda v: 3,
-                WARN,
-                True,
-            ),
-            RequiredParameter(
-                "EKF2_GPS_CTRL",
-                "0",
-                "GPS would pull against mocap or vision",
-                lambda v: v == 0,
-                lambda v: 0,
-                WARN,
-            ),
-            RequiredParameter(
-                "EKF2_MAG_TYPE",
-                "5 (none)",
-                "the compass would pull against the yaw of mocap or vision",
-                lambda v: v == 5,
-                lambda v: 5,
-                WARN,
-                True,
-            ),
-            RequiredParameter(
-                "EKF2_EV_DELAY",
-                "about 0 ms",
-                "poses carry the time when they were taken ([pose] latency)",
-                lambda v: v <= 20.0,
-                lambda v: 0.0,
-                WARN,
-                True,
-            ),
-        ]
-    return out
 
 
 def look(
@@ -387,10 +222,10 @@ def judge(link: VehicleLink, required: RequiredParameter) -> Parameter:
         return judge(link, required.otherwise)
     if value is None:
         return Parameter(required.name, "not there", required.wanted, required.why, NOTE)
-    if required.good(value):
+    if required.rule.good(value):
         state = NOTE if required.state == NOTE else OK
         return Parameter(required.name, _shown(value), required.wanted, required.why, state)
-    change = required.change(value)
+    change = required.rule.change(value)
     if change is not None:
         change = type(value)(change)  # PX4 takes an INT32 as an INT32 only
     return Parameter(

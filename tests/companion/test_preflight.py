@@ -16,7 +16,8 @@ from test_companion_cli import companion
 
 from trueflight.companion.message_rates import Rates, odometry_too_low
 from trueflight.companion.pose import PoseSettings
-from trueflight.companion.preflight import hover_of, judge, required_parameters
+from trueflight.companion.preflight import hover_of, judge
+from trueflight.companion.required_parameters import required_parameters
 from trueflight.companion.settings import Settings
 
 
@@ -128,9 +129,9 @@ class TestWishes:
     def test_a_fast_loop_wants_a_fast_estimator(self) -> None:
         assert "EKF2_PREDICT_US" not in self.names(Settings(rate=100.0))
         (required,) = [w for w in required_parameters(Settings(rate=250.0)) if w.name == "EKF2_PREDICT_US"]
-        assert required.good(4000)
-        assert not required.good(10000)
-        assert required.change(10000) == 4000
+        assert required.rule.good(4000)
+        assert not required.rule.good(10000)
+        assert required.rule.change(10000) == 4000
         assert required.reboot
 
     def test_mocap_wants_the_estimator_to_use_it(self) -> None:
@@ -138,16 +139,16 @@ class TestWishes:
         assert {"EKF2_EV_CTRL", "EKF2_HGT_REF", "EKF2_GPS_CTRL"} <= self.names(settings)
         assert "EKF2_EV_CTRL" not in self.names(Settings())
         (required,) = [w for w in required_parameters(settings) if w.name == "EKF2_EV_CTRL"]
-        assert required.good(11)
-        assert required.good(15)
-        assert not required.good(4)
-        assert required.change(4) == 15, "what somebody set besides stays"
+        assert required.rule.good(11)
+        assert required.rule.good(15)
+        assert not required.rule.good(4)
+        assert required.rule.change(4) == 15, "what somebody set besides stays"
 
     def test_every_change_is_good(self) -> None:
         for required in required_parameters(Settings(rate=250.0, pose=PoseSettings(enabled=True))):
             for value in (-1, 0, 1, 7, 20000):
-                change = required.change(value)
-                assert change is None or required.good(change), required.name
+                change = required.rule.change(value)
+                assert change is None or required.rule.good(change), required.name
 
 
 def ticks(seconds: float, thrust: float, speed: float = 0.0, tilt: float = 0.0) -> dict[str, np.ndarray]:
