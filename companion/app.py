@@ -136,7 +136,7 @@ class Companion:
         self.link.on_odometry = self._control
         self.link.on_error = self._wire_error
         self.link.on_blind = self.watchdog.tick  # nothing to control by, but the control thread is well
-        self.link.on_notice = self._autopilot_tells
+        self.link.messages.on_notice = self._autopilot_tells
         try:
             self._settle_rates(rate)
         except InputError:
@@ -259,7 +259,7 @@ class Companion:
     def _settle_rates(self, rate: float) -> None:
         """Ask for rates until they arrive; an autopilot that has just started takes a moment."""
         for _ in range(_RATE_TRIES):
-            self.link.request_rates(rate)
+            self.link.commands.request_rates(rate)
             self.readiness.rates = self.link.measure(1.0)
             reason = self.readiness.rates_too_low(self.readiness.rates)
             if not reason:

@@ -168,7 +168,7 @@ def check(
     )
     try:
         wanted = rate if rate is not None else defaults.rate
-        link.request_rates(wanted)
+        link.commands.request_rates(wanted)
         link.measure(0.5)  # the new rates take a moment
         rates = link.measure(2.0)
         names = ("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_RC_IN_MODE", "EKF2_PREDICT_US")
@@ -182,7 +182,7 @@ def check(
             "battery_voltage": link.latest.battery_voltage,
             "rotor_speeds": len(link.latest.rotor_speed),
             "accelerometer": link.latest.specific_force is not None,
-            "parameters": {name: link.parameter(name) for name in names},
+            "parameters": {name: link.parameters.read(name) for name in names},
             "malformed_messages": link.malformed,
         }
     finally:

@@ -133,11 +133,13 @@ def _rates(settings: Settings, root: Path) -> Iterator[Finding]:
         yield Finding("autopilot", "none", "", f"{error}; {advice}", FAIL)
         return
     try:
-        link.request_rates(settings.rate)
+        link.commands.request_rates(settings.rate)
         time.sleep(0.5)
         rates = link.measure(2.0)
         reason = odometry_too_low(rates, settings.rate)
-        yield Finding("autopilot", f"{link.autopilot_version()}, {link.latest.flight_mode}", "", "", OK)
+        yield Finding(
+            "autopilot", f"{link.commands.autopilot_version()}, {link.latest.flight_mode}", "", "", OK
+        )
         yield Finding("odometry", f"{rates.odometry:.0f} Hz", "", reason, FAIL if reason else OK)
         slow = rates.imu < 0.5 * min(settings.rate, 100.0)
         advice = link_too_slow("HIGHRES_IMU") if slow else ""

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+import time
+from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 
+_COUNTED = ("HIGHRES_IMU", "BATTERY_STATUS", "ESC_STATUS", "MODE")
 _ONBOARD_RATE = (
     80_000  # bytes/s: odometry and accelerometer for 100 Hz of control beside an onboard link's other streams
 )
@@ -29,6 +33,43 @@ class Rates:
     def describe(self) -> dict[str, float]:
         """For the status."""
         return {"odometry": round(self.odometry, 1), "imu": round(self.imu, 1)}
+
+
+class MessageCounter:
+    """Counts what arrives, on MAVSDK's thread; any thread may measure, one at a time."""
+
+    def __init__(self) -> None:
+        self._counts = dict.fromkeys(_COUNTED, 0)
+        self._times: deque[int] = deque(maxlen=4096)
+
+    def count(self, name: str) -> None:
+        """One more; raises `KeyError` for a message that is not counted."""
+        self._counts[name] += 1
+
+    def odometry(self, time_us: int) -> None:
+        """One more odometry message, with its time by the vehicle's clock."""
+        self._times.append(time_us)
+
+    def measure(self, duration: float) -> Rates:
+        """Count for `duration` s."""
+        before = dict(self._counts)
+        self._times.clear()
+        begin = time.monotonic()
+        time.sleep(duration)
+        elapsed = time.monotonic() - begin
+        times = list(self._times)
+        count = {name: (self._counts[name] - before[name]) / elapsed for name in before}
+        gaps = [1e-6 * (b - a) for a, b in pairwise(times)]
+        span = 1e-6 * (times[-1] - times[0]) if len(times) > 1 else 0.0
+        return Rates(
+            odometry=(len(times) - 1) / span if span > 0.0 else 0.0,
+            imu=count["HIGHRES_IMU"],
+            battery=count["BATTERY_STATUS"],
+            esc=count["ESC_STATUS"],
+            longest_gap=max(gaps, default=math.inf),
+            duration=elapsed,
+            mode=count["MODE"],
+        )
 
 
 def odometry_too_low(rates: Rates, wanted: float, share: float = 0.75) -> str:

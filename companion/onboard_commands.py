@@ -86,7 +86,7 @@ def preflight_command(
             report = preflight.look(link, settings, believed, tell, pose)
             if set_parameters:
                 tell("setting parameters")
-                changed = preflight.set_parameters(link, [*report.parameters, *report.hover])
+                changed = preflight.set_parameters(link.parameters, [*report.parameters, *report.hover])
                 if changed:
                     report = preflight.look(link, settings, believed, tell, pose)
     finally:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from trueflight.companion.access import access_findings
+from trueflight.companion.commands import Parameters
 from trueflight.companion.findings import FAIL, NOTE, OK, WARN, Finding, rows_of
 from trueflight.companion.message_rates import Rates, link_too_slow, odometry_too_low
 from trueflight.companion.pose import PoseFeed
@@ -91,7 +92,7 @@ def look(
     if link.latest.armed:
         raise InputError("the vehicle is armed; disarm it, then look again")
     progress("message rates")
-    link.request_rates(settings.rate)
+    link.commands.request_rates(settings.rate)
     time.sleep(0.5)
     rates = link.measure(2.0)
     if pose is not None:
@@ -106,12 +107,12 @@ def look(
     parameters = []
     for required in required_parameters(settings):
         progress(required.name)
-        parameters.append(judge(link, required))
+        parameters.append(judge(link.parameters.read, required))
     progress("hover thrust")
     records = Path(settings.records)
     hover = list(_hover(link, vehicle, records))
     return Preflight(
-        link.autopilot_version(),
+        link.commands.autopilot_version(),
         arming,
         tuple(parameters),
         (*_rates(link, settings, rates), *_poses(pose)),
@@ -120,13 +121,13 @@ def look(
     )
 
 
-def set_parameters(link: VehicleLink, parameters: Sequence[Parameter]) -> list[str]:
+def set_parameters(autopilot: Parameters, parameters: Sequence[Parameter]) -> list[str]:
     """Set every parameter that has a `change`; one line for each: what was done, or why not."""
     lines = []
     for parameter in parameters:
         if parameter.change is None:
             continue
-        reason = link.set_parameter(parameter.name, parameter.change)
+        reason = autopilot.write(parameter.name, parameter.change)
         done = f"{parameter.name}: {parameter.value} -> {_shown(parameter.change)}"
         after = "; acts after the autopilot's restart" if parameter.reboot else ""
         lines.append(f"{parameter.name} not set: {reason}" if reason else done + after)
@@ -135,9 +136,9 @@ def set_parameters(link: VehicleLink, parameters: Sequence[Parameter]) -> list[s
 
 def _arming(link: VehicleLink, settings: Settings, vehicle: Vehicle | None) -> Iterator[Finding]:
     for _ in range(3):  # also turns STATUSTEXT on, which PX4 before 1.13 tells its reasons by
-        link.show_as_ground_station()
+        link.commands.show_as_ground_station()
         time.sleep(0.3)
-    report = link.arming_report()
+    report = link.commands.arming_report()
     if report is None:
         texts = [text for text in link.latest.texts if "fail" in text.lower() or "denied" in text.lower()]
         for text in dict.fromkeys(texts):
@@ -215,11 +216,11 @@ def _shown(value: Number) -> str:
     return str(value) if isinstance(value, int) else f"{value:g}"
 
 
-def judge(link: VehicleLink, required: RequiredParameter) -> Parameter:
-    """What the autopilot has where one is required, and what should become of it."""
-    value = link.parameter(required.name)
+def judge(read: Callable[[str], Number | None], required: RequiredParameter) -> Parameter:
+    """What the autopilot has where one is required, and what should become of it; `read` asks it for one by name."""
+    value = read(required.name)
     if value is None and required.otherwise is not None:
-        return judge(link, required.otherwise)
+        return judge(read, required.otherwise)
     if value is None:
         return Parameter(required.name, "not there", required.wanted, required.why, NOTE)
     if required.rule.good(value):
@@ -298,7 +299,7 @@ def hover_of(ticks: dict[str, np.ndarray], name: str) -> Hover | None:
 
 
 def _hover(link: VehicleLink, vehicle: Vehicle | None, records: Path) -> Iterator[Parameter]:
-    theirs = link.parameter("MPC_THR_HOVER")
+    theirs = link.parameters.read("MPC_THR_HOVER")
     shown = "not there" if theirs is None else f"{theirs:.2f}"
     if vehicle is None:
         yield Parameter("MPC_THR_HOVER", shown, "", "pass --vehicle to compare it", NOTE)
@@ -318,7 +319,7 @@ def _hover(link: VehicleLink, vehicle: Vehicle | None, records: Path) -> Iterato
         return
     away = theirs / best - 1.0
     state = OK if abs(away) <= _HOVER_NEAR else WARN
-    use = link.parameter("MPC_USE_HTE")
+    use = link.parameters.read("MPC_USE_HTE")
     why = "PX4's own modes, its Land too, begin with it" + (" and learn it in flight" if use else "")
     change = round(learned.thrust, 2) if learned is not None and state == WARN else None
     yield Parameter("MPC_THR_HOVER", shown, f"{best:.2f}", why, state, change)

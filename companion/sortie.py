@@ -106,7 +106,7 @@ class Sortie:
         time.sleep(_STREAM_BEFORE_OFFBOARD)
         if flight.sent == sent:
             return "no odometry, so no setpoint could be sent"
-        reason = link.set_mode("OFFBOARD")
+        reason = link.commands.set_mode("OFFBOARD")
         if reason:
             return self._refused(f"the autopilot refused Offboard ({reason})")
         if not wait_until(lambda: latest.flight_mode == "OFFBOARD", _MODE_TIMEOUT):
@@ -114,7 +114,7 @@ class Sortie:
         progress.record, reason = self._records.begin(mission, self._deployment.flies_with(mission))
         if reason:
             return reason
-        reason = link.arm()
+        reason = link.commands.arm()
         if reason:
             return self._refused(f"the autopilot refused to arm ({reason})")
         if not wait_until(lambda: latest.armed, _ARM_TIMEOUT):
@@ -129,7 +129,7 @@ class Sortie:
 
     def _refused(self, what: str) -> str:
         """Why, in plain words, where the autopilot tells; asked while setpoints are still streaming."""
-        report = self._link.arming_report()
+        report = self._link.commands.arming_report()
         problems = report.reasons(streaming=True) if report is not None else ()
         return f"{what}: {'; '.join(problem.line for problem in problems)}" if problems else what
 
@@ -169,7 +169,7 @@ class _Escort:
         offboard = self._link.latest.flight_mode == "OFFBOARD"
         if flight.wants_land and offboard and now - self._asked > _LAND_RETRY:
             self._asked, self._tries = now, self._tries + 1
-            reason = self._link.set_mode("LAND")
+            reason = self._link.commands.set_mode("LAND")
             if reason and self._tries >= _LAND_TRIES:
                 flight.give_up(f"the autopilot refused Land ({reason})")
 
@@ -179,7 +179,7 @@ class _Escort:
         on_ground = latest.landed == "on ground" and flight.phase != TAKEOFF and not flight.sending
         self._grounded = min(self._grounded, now) if on_ground else math.inf
         if now - self._grounded > _DISARM_AFTER and latest.armed and flight.phase == LANDING:
-            self._link.disarm()
+            self._link.commands.disarm()
             self._grounded = math.inf
 
     def look_for_odometry(self, now: float) -> None:

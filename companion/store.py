@@ -188,17 +188,6 @@ class ModelStore:
             if name == self._staged:
                 self._forget_staged()
 
-    def deploy(self, onnx: bytes) -> dict[str, Any]:
-        """Check a model and make it live at once, for whoever knows already that it is good; accepted, or why not."""
-        finding = self.stage(onnx)
-        if not finding.accepted:
-            return {"accepted": False, "reason": finding.reason}
-        reason = self.commit(model_hash(onnx))
-        if reason:
-            self.discard(model_hash(onnx))
-            return {"accepted": False, "reason": reason}
-        return {"accepted": True, "reason": finding.reason, **self.describe()}
-
     def roll_back(self) -> dict[str, Any]:
         """Make the previous model live; with none left, only `lqr` can be flown."""
         with self._lock:
@@ -304,23 +293,27 @@ class ModelStore:
                 self._history.append(name)
 
     def _save(self, history: list[str]) -> None:
-        """Write the history, and take it over once it is on the disk."""
-        part = self._folder / (_HISTORY + ".part")
-        try:
-            with part.open("w", encoding="utf-8") as file:
-                json.dump(history, file)
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(self._folder / _HISTORY)
-        except OSError:
-            _remove(part)
-            raise
-        folder = os.open(self._folder, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        """Take a history over, once it is on the disk."""
+        _write_names(self._folder, history)
         self._history = history
+
+
+def _write_names(folder: Path, names: list[str]) -> None:
+    part = folder / (_HISTORY + ".part")
+    try:
+        with part.open("w", encoding="utf-8") as file:
+            json.dump(names, file)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(folder / _HISTORY)
+    except OSError:
+        _remove(part)
+        raise
+    place = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(place)
+    finally:
+        os.close(place)
 
 
 def _remove(path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from trueflight.companion.store import ModelStore
 from trueflight.models import contract
 
 RANGES = {
@@ -229,3 +230,12 @@ def greedy_model() -> bytes:
         "w": np.zeros((len(contract.FEATURES), 3), dtype=np.float32),
     }
     return packed(nodes, constants, lambda features: np.zeros((len(features), 3)))
+
+
+def make_live(store: ModelStore, onnx: bytes) -> str:
+    """Stage a model and commit it, as a flight does in which it has proved itself; its hash."""
+    finding = store.stage(onnx)
+    assert finding.accepted, finding.reason
+    name = contract.model_hash(onnx)
+    assert store.commit(name) == ""
+    return name

@@ -19,6 +19,7 @@ from onnx_models import (
     endless_model,
     greedy_model,
     linear_model,
+    make_live,
     nan_model,
 )
 from rig import PATIENT, Bridge, Companion, free_port, wait_for
@@ -335,7 +336,7 @@ class TestStore:
         self, tmp_path: Path
     ) -> None:
         store = ModelStore(tmp_path, VEHICLE, 0.1)
-        store.deploy(drag_model(0.1))
+        make_live(store, drag_model(0.1))
         live, staged = contract.model_hash(drag_model(0.1)), contract.model_hash(drag_model(0.2))
         assert store.stage(drag_model(0.2)).accepted
         assert (store.live_name, store.staged_name) == (live, staged)
@@ -351,7 +352,7 @@ class TestStore:
     ) -> None:
         store = ModelStore(tmp_path, VEHICLE, 0.1)
         first, second, third = (drag_model(x) for x in (0.1, 0.2, 0.3))
-        store.deploy(first)
+        make_live(store, first)
         store.stage(second)
         assert store.commit(contract.model_hash(second)) == ""
         assert store.previous_name == contract.model_hash(first)
@@ -364,7 +365,7 @@ class TestStore:
 
     def test_the_live_model_staged_once_more_stays_live_when_it_is_discarded(self, tmp_path: Path) -> None:
         store = ModelStore(tmp_path, VEHICLE, 0.1)
-        store.deploy(drag_model(0.1))
+        make_live(store, drag_model(0.1))
         store.stage(drag_model(0.1))
         store.discard(contract.model_hash(drag_model(0.1)))
         assert store.live is not None

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from onnx_models import drag_model
+from onnx_models import drag_model, make_live
 from rig import VEHICLE, Bridge, free_port
 from test_companion_cli import companion
 
@@ -130,7 +130,7 @@ def test_zenoh_ends(tmp_path: Path) -> None:
 def test_the_live_model_is_checked_again(tmp_path: Path) -> None:
     settings = Settings(vehicle=str(VEHICLE), models=str(tmp_path / "models"))
     assert found("model", settings, tmp_path)["model"].state == NOTE
-    ModelStore(Path(settings.models), load_vehicle(VEHICLE), 0.02).deploy(drag_model(0.1))
+    make_live(ModelStore(Path(settings.models), load_vehicle(VEHICLE), 0.02), drag_model(0.1))
     findings = found("model", settings, tmp_path)
     assert findings["model"].state == OK, findings
     assert "an inference" in findings["model"].value

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from onnx_models import constant_model, drag_model
+from onnx_models import constant_model, drag_model, make_live
 
 from trueflight.companion.store import ModelStore
 from trueflight.models import contract
@@ -21,8 +21,9 @@ class TestStore:
         store = ModelStore(tmp_path, VEHICLE, 0.1)
         assert store.live is None
         first, second = constant_model(0.1, 0, 0), drag_model(0.2)
-        assert store.deploy(first)["accepted"]
-        answer = store.deploy(second)
+        make_live(store, first)
+        make_live(store, second)
+        answer = store.describe()
         assert answer["live"] == contract.model_hash(second)
         assert [entry["hash"] for entry in answer["models"]] == [
             contract.model_hash(m) for m in (first, second)
@@ -34,16 +35,16 @@ class TestStore:
 
     def test_a_refused_model_leaves_the_live_one_alone(self, tmp_path: Path) -> None:
         store = ModelStore(tmp_path, VEHICLE, 0.1)
-        store.deploy(constant_model(0.1, 0, 0))
-        answer = store.deploy(b"nonsense")
-        assert not answer["accepted"]
+        make_live(store, constant_model(0.1, 0, 0))
+        assert not store.stage(b"nonsense").accepted
+        assert store.commit(contract.model_hash(b"nonsense")) != ""
         assert store.live is not None
         assert store.live([0.0] * 10) == pytest.approx([0.1, 0.0, 0.0])
 
     def test_rolling_back_goes_through_the_earlier_models_to_none(self, tmp_path: Path) -> None:
         store = ModelStore(tmp_path, VEHICLE, 0.1)
-        store.deploy(constant_model(0.1, 0, 0))
-        store.deploy(constant_model(0.2, 0, 0))
+        make_live(store, constant_model(0.1, 0, 0))
+        make_live(store, constant_model(0.2, 0, 0))
         assert store.roll_back()["accepted"]
         assert store.live is not None
         assert store.live([0.0] * 10) == pytest.approx([0.1, 0.0, 0.0])
@@ -52,7 +53,7 @@ class TestStore:
         assert not store.roll_back()["accepted"]
 
     def test_a_model_that_no_longer_fits_is_not_live_after_a_restart(self, tmp_path: Path) -> None:
-        ModelStore(tmp_path, VEHICLE, 0.1).deploy(constant_model(0.1, 0, 0))
+        make_live(ModelStore(tmp_path, VEHICLE, 0.1), constant_model(0.1, 0, 0))
         heavier = ModelStore(tmp_path, replace(VEHICLE, mass=0.9), 0.1)
         assert heavier.live is None
         assert "made for mass" in heavier.refused_at_start[0]
