@@ -9,13 +9,16 @@ import threading
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from trueflight.companion import onboard_commands
 from trueflight.models.errors import run_command_line
 from trueflight.models.printed import print_json_line
+
+if TYPE_CHECKING:
+    from trueflight.companion.app import Companion
 
 app = typer.Typer(
     name="companion",
@@ -85,7 +88,6 @@ def run(
     """
     from trueflight.companion.app import Companion
     from trueflight.companion.settings import load_settings
-    from trueflight.companion.zenoh_session import INSECURE
 
     settings = load_settings(config)
     given: dict[str, Any] = {
@@ -99,11 +101,6 @@ def run(
         "models": models,
         "keys": keys,
     }
-    flags: dict[str, Any] = {
-        name: value if isinstance(value, (int, float)) else str(value)
-        for name, value in given.items()
-        if value is not None
-    }
     zenoh: dict[str, Any] = {
         "mode": zenoh_mode,
         "connect": tuple(zenoh_connect) if zenoh_connect else None,
@@ -112,10 +109,21 @@ def run(
         "cfg": tuple(zenoh_cfg) if zenoh_cfg else None,
         "insecure": insecure or None,
     }
-    changes = {name: value for name, value in zenoh.items() if value is not None}
-    settings = replace(settings, **flags, zenoh=replace(settings.zenoh, **changes))
+    flags: dict[str, Any] = {
+        name: value if isinstance(value, (int, float)) else str(value) for name, value in _set(given).items()
+    }
+    settings = replace(settings, **flags, zenoh=replace(settings.zenoh, **_set(zenoh)))
+    _serve(Companion(settings), settings.connect)
 
-    companion = Companion(settings)
+
+def _set(flags: dict[str, Any]) -> dict[str, Any]:
+    """Those that were given."""
+    return {name: value for name, value in flags.items() if value is not None}
+
+
+def _serve(companion: Companion, address: str) -> None:
+    """Tell that it is ready, fly until a signal, and end even where the control thread hangs."""
+    from trueflight.companion.zenoh_session import INSECURE
 
     def stop(number: int, frame: FrameType | None) -> None:
         if companion.director.stopping.is_set():
@@ -131,7 +139,7 @@ def run(
 
         Console(stderr=True).print(f"[bold red]{INSECURE}[/]; it {' and '.join(companion.access['exposed'])}")
     where = ", ".join(companion.access["listen"]) or "Zenoh"
-    ready = f"{companion.vehicle.name} at {rates.odometry:.0f} Hz on {settings.connect}, missions on {where}"
+    ready = f"{companion.vehicle.name} at {rates.odometry:.0f} Hz on {address}, missions on {where}"
     typer.echo(f"ready: {ready}")
     sys.stdout.flush()
     companion.watchdog.ready(ready)

@@ -87,10 +87,7 @@ class Service:
         )
 
 
-def texts(service: Service) -> dict[str, str]:
-    """Path below the root to the text of each file, without its mark."""
-    home = "read-only" if service.command.startswith(("/home", "/root")) else "yes"
-    unit = f"""\
+_UNIT = """\
 [Unit]
 Description=trueflight companion: flies the vehicle beside its autopilot
 After=network.target time-sync.target
@@ -100,23 +97,23 @@ StartLimitIntervalSec=0
 [Service]
 Type=notify
 NotifyAccess=main
-ExecStart={service.command} run --config /{CONFIG}
-User={service.user}
+ExecStart={command} run --config /{config}
+User={user}
 SupplementaryGroups=dialout
-StateDirectory={Path(STATE).name}
-WorkingDirectory={STATE}
+StateDirectory={state}
+WorkingDirectory={home}
 
 # A companion that comes back in flight sends nothing: the vehicle is its autopilot's until it has landed.
 Restart=always
 RestartSec=2
 # Fed by the control tick alone: no odometry, or a control thread that hangs, for so long means a new start.
-WatchdogSec={WATCHDOG}
+WatchdogSec={watchdog}
 TimeoutStartSec=120
 # On SIGTERM in flight it lets the autopilot land first.
 TimeoutStopSec=120
 
 # What the control thread may ask for; how much it does stands in the configuration (realtime).
-LimitRTPRIO={service.realtime}
+LimitRTPRIO={realtime}
 OOMScoreAdjust=-500
 LimitCORE=0
 Environment=OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
@@ -125,13 +122,13 @@ Environment=OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
 NoNewPrivileges=yes
 CapabilityBoundingSet=
 ProtectSystem=strict
-ProtectHome={home}
+ProtectHome={protect_home}
 PrivateTmp=yes
 PrivateMounts=yes
 UMask=0077
 RemoveIPC=yes
 DevicePolicy=closed
-{_devices()}
+{devices}
 ProtectProc=invisible
 ProtectClock=yes
 ProtectHostname=yes
@@ -155,6 +152,22 @@ SystemCallFilter=~@privileged @obsolete @keyring
 [Install]
 WantedBy=multi-user.target
 """
+
+
+def texts(service: Service) -> dict[str, str]:
+    """Path below the root to the text of each file, without its mark."""
+    protect_home = "read-only" if service.command.startswith(("/home", "/root")) else "yes"
+    unit = _UNIT.format(
+        command=service.command,
+        config=CONFIG,
+        user=service.user,
+        state=Path(STATE).name,
+        home=STATE,
+        watchdog=WATCHDOG,
+        realtime=service.realtime,
+        protect_home=protect_home,
+        devices=_devices(),
+    )
     sysusers = f"""\
 u {service.user} - "trueflight companion" {STATE}
 m {service.user} dialout
