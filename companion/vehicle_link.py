@@ -72,6 +72,7 @@ class VehicleLink:
         self.latest = self.messages.latest
         self._overtaken = 0
         self._shares_clock = False
+        self._closing = False
         self._mavsdk = self._opened()
         autopilot = self._autopilot(timeout, system)
         self._system = autopilot.get_system_id()
@@ -92,6 +93,7 @@ class VehicleLink:
 
     def close(self) -> None:
         """Disconnect."""
+        self._closing = True
         self._direct.destroy()
         self._mavsdk.destroy()
 
@@ -222,6 +224,9 @@ class VehicleLink:
             except (KeyError, TypeError, ValueError, IndexError) as error:
                 self.malformed += 1
                 self.on_error(f"{message.message_name}: {type(error).__name__}: {error}")
+            except RuntimeError:
+                if not self._closing:  # what a last message makes us send while we disconnect goes nowhere
+                    raise
 
         return callback
 
