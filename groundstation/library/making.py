@@ -15,7 +15,7 @@ from trueflight.groundstation.versions.choice import check_vehicle, choose_model
 from trueflight.groundstation.versions.store import DEFAULT_STORE, add_effect
 from trueflight.models import flight as columns
 from trueflight.models import model as versions
-from trueflight.models.design import Design
+from trueflight.models.design import Design, save_design
 from trueflight.models.effect import Effect
 from trueflight.models.effects import catalogue
 from trueflight.models.errors import InputError
@@ -182,7 +182,7 @@ def simulate(
     hidden: str | Sequence[str] = (),
     correction: str | Path | None = None,
     controller: str = "",
-    design: str | Path | None = None,
+    design: Design | str | Path | None = None,
     noise: float = 1.0,
     seed: int = 0,
 ) -> Flight:
@@ -191,13 +191,17 @@ def simulate(
     `trajectory` with its `parameters` (SI units) is one of `groundstation trajectories`, or a CSV file of setpoints.
     `vehicle` is the vehicle.toml of what its owner believes, `hidden` what the simulated vehicle has beside it: NAME,
     NAME:SIZE, "random" (drawn by `seed`; `reveal` tells), "rich". `correction` is an ONNX file, `controller` lqr,
-    lqr_integral or corrected (by default corrected where there is a correction), `design` a file of gains (None: that
-    beside the vehicle). `noise` is a factor on that of the sensors.
+    lqr_integral or corrected (by default corrected where there is a correction), `design` the gains, or their file
+    (None: that beside the vehicle). `noise` is a factor on that of the sensors.
 
     It runs `sim-bridge`, the program, and so needs it installed. Raises `InputError` for whatever that refuses.
     """
     from trueflight.groundstation.operate.processes import run_json
 
+    if isinstance(design, Design):
+        gains = Path(output).with_suffix(".design.json")
+        save_design(design, gains)
+        design = gains
     words: list[object] = ["sim-bridge", "fly", "--trajectory", trajectory, "-o", output, "--json"]
     words += ["--vehicle", vehicle, "--seed", seed, "--noise", noise]
     for name, value in (parameters or {}).items():

@@ -153,6 +153,8 @@ def maps(table: Table, left_table: Table, names: tuple[str, str], colours: Colou
 def _grid(count: int) -> tuple[Any, list[Any]]:
     rows = -(-count // 3)
     made, axes = figure(rows, 3, WIDTH, 1.75 * rows)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("m/s²")
     flat = list(axes.flat)
     for ax in flat[count:]:
         ax.set_visible(False)
