@@ -158,8 +158,9 @@ class FlightStateMachine:
     def tick(self, odometry: Odometry, latest: Latest) -> Outcome:
         """Decide what to send for this odometry message."""
         interval = self._hear(odometry)
-        out = Outcome(self.phase, interval, self._course.position(odometry), model=self.models.live)
-        if self.phase != IDLE:
+        phase = self._phases.phase
+        out = Outcome(phase, interval, self._course.position(odometry), model=self.models.live)
+        if phase != IDLE:
             self._answer(odometry, latest, out)
         self._sending = out.step is not None
         self.ticked += 1
@@ -246,7 +247,7 @@ class FlightStateMachine:
         """The control law's answer, on the way of the mission."""
         guard, controller = mission.guard, self._phases.controller
         out.reference = self._reference(mission, odometry, out)
-        out.phase = self.phase
+        out.phase = self._phases.phase
         state = State(
             out.position,
             odometry.velocity,
@@ -263,7 +264,7 @@ class FlightStateMachine:
 
     def _reference(self, mission: Mission, odometry: Odometry, out: Outcome) -> ReferenceSample:
         course, guard = self._course, mission.guard
-        if course.late >= 0.0 and not self.wants_land:
+        if course.late >= 0.0 and not self._phases.wants_land:
             assert course.leg is not None
             acts = course.leg.corrects and guard is not None and guard.live != "" and not guard.tripped
             fading = acts and guard is not None and guard.engaged < 1.0

@@ -23,8 +23,9 @@ _TUMBLED = 1.4
 """rad of tilt, twice what the cascade may ask for: a vehicle there for longer than `_TUMBLING` s has crashed, or
 nothing that a linear design sends can bring it back."""
 _TUMBLING = 0.5
-_MODE_UNKNOWN = 2.5
-"""s of the vehicle's clock without a word of mode and arming after which nothing is sent until they are told again.
+_LEAST_COSINE = math.cos(_TUMBLED)
+_MODE_UNKNOWN_US = 2_500_000
+"""us of the vehicle's clock without a word of mode and arming after which nothing is sent until they are told again.
 
 PX4 sends HEARTBEAT once a second whatever is asked for, and CURRENT_MODE (from 1.15 on) twice a second and at once when
 the mode changes: two heartbeats may be lost."""
@@ -124,7 +125,7 @@ class ReasonsToStop:
     def mode_unknown(self, odometry: Odometry, latest: Latest) -> bool:
         """Whether somebody else may fly by now: mode and arming were not told lately, or not since a gap."""
         told = latest.mode_time_us
-        since = max(odometry.vehicle_time_us - round(1e6 * _MODE_UNKNOWN), self._heard_again)
+        since = max(odometry.vehicle_time_us - _MODE_UNKNOWN_US, self._heard_again)
         return told is not None and told < since
 
     def stale(self, age: float) -> Stop | None:
@@ -180,7 +181,7 @@ class ReasonsToStop:
 
     def _tumbled(self, odometry: Odometry, now: float) -> Stop | None:
         _, x, y, _ = odometry.quaternion
-        tumbled = 1.0 - 2.0 * (x * x + y * y) < math.cos(_TUMBLED)  # body z against the vertical
+        tumbled = 1.0 - 2.0 * (x * x + y * y) < _LEAST_COSINE  # body z against the vertical
         self._tumbled_since = min(self._tumbled_since, now) if tumbled else math.inf
         if now - self._tumbled_since > _TUMBLING:
             text = f"tilted by more than {math.degrees(_TUMBLED):.0f} degrees: silent"
