@@ -160,6 +160,14 @@ def test_the_law_stands_alone_and_is_all_that_the_simulator_sees_of_the_companio
             assert not seen, f"{path.relative_to(ROOT)} imports {sorted(seen)}"
 
 
+def test_mavsdk_belongs_to_the_link() -> None:
+    """What decides over a flight, and its tests, need no wire."""
+    users = {
+        path.name for path in (ROOT / "companion").rglob("*.py") if "mavsdk" in map(_owner, imports(path))
+    }
+    assert users == {"vehicle_link.py", "commands.py"}
+
+
 def test_groundstation_never_imports_the_simulator() -> None:
     for path in sorted((ROOT / "groundstation").rglob("*.py")):
         assert not any(n.startswith("trueflight.sim_bridge") for n in imports(path)), path
