@@ -222,7 +222,15 @@ class RotationalRms:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The result of `diagnose`. RMS figures in m/s² over all axes, behind the stated bandwidth in Hz."""
+    """The result of `diagnose`. RMS figures in m/s² over all axes, behind the stated bandwidth in Hz.
+
+    `base` is the model that was asked about, `model` the same with every effect found, `effects` what the flight says
+    of each. `axes` are the body axes that were measured (0 to 2). `validation_before` and `validation_after` are the
+    RMS on the held-out flight, None without one. `clock_shift` is by how much later than its vehicle file says the
+    command acts, s, None where no clock was fitted. `unexplained` tells whether predictable structure is left;
+    `left_out` the share of the samples that did not count, by reason. `rotational` is the residual of the angular
+    acceleration, None where it was not seen.
+    """
 
     flight: Flight
     base: Model

@@ -224,5 +224,5 @@ class Collection:
 
 
 def record_name(number: int, sortie: Sortie) -> str:
-    """File name of a database's flight, which sorts in the order of flying."""
+    """File name of a database's flight, the `sortie` with this `number`; names sort in the order of flying."""
     return f"{number:03d}-{sortie.trajectory}.mcap"

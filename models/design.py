@@ -70,7 +70,7 @@ class Design:
 
 
 def hover_input_matrix(mass: float) -> np.ndarray:
-    """`A_zeta` of (9): acceleration in the heading frame of (phi, theta, T - m g); shape (3, 3)."""
+    """`A_zeta` (3, 3) of (9) for a `mass` in kg: acceleration in the heading frame of (phi, theta, T - m g)."""
     return np.array([[0.0, GRAVITY, 0.0], [-GRAVITY, 0.0, 0.0], [0.0, 0.0, 1.0 / mass]])
 
 

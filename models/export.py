@@ -54,7 +54,8 @@ class Correction(torch.nn.Module):
 
 
 def sequential(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Sequential:
-    """Layers as torch trains and exports them, with rectified linear units between."""
+    """The `layers`, weights (K, F) and biases (K,), as torch trains and exports them, with rectified linear units
+    between."""
     modules: list[torch.nn.Module] = []
     for weights, biases in layers:
         if modules:

@@ -20,7 +20,8 @@ def feature_names(model: Model) -> tuple[str, ...]:
 
 
 def features_of_flight(flight: Flight, rows: np.ndarray | slice = slice(None)) -> dict[str, np.ndarray]:
-    """Every feature (N,) of the flight, units as in `models.contract`. Voltage is nominal where none was recorded.
+    """Every feature (N,) of the flight's `rows`, units as in `models.contract`. Voltage is nominal where none was
+    recorded.
 
     Raises `InputError` where position, velocity, attitude or command is missing.
     """
@@ -45,7 +46,7 @@ def features_of_flight(flight: Flight, rows: np.ndarray | slice = slice(None)) -
 
 
 def feature_matrix(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
-    """The features as float32 (N, F), in the order of `names`."""
+    """The features `columns`, each (N,), as float32 (N, F) in the order of `names`."""
     unknown = [n for n in names if n not in columns]
     if unknown:
         raise InputError(f"unknown features {', '.join(unknown)}; known: {', '.join(columns)}")

@@ -10,7 +10,7 @@ import numpy as np
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3), body to world, of unit quaternions (..., 4)."""
+    """Rotation matrices (..., 3, 3), body to world, of unit quaternions: `quaternion` (..., 4), w, x, y, z."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
     return np.stack(
         [
@@ -23,17 +23,17 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Body vectors (..., 3) expressed in the world."""
+    """Body vectors `vector` (..., 3) expressed in the world, with `quaternion` (..., 4) body to world."""
     return np.einsum("...ij,...j->...i", rotation_matrix(quaternion), vector)
 
 
 def rotate_inverse(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """World vectors (..., 3) expressed in the body."""
+    """World vectors `vector` (..., 3) expressed in the body, with `quaternion` (..., 4) body to world."""
     return np.einsum("...ji,...j->...i", rotation_matrix(quaternion), vector)
 
 
 def euler_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
-    """Roll phi, pitch theta, yaw psi (..., 3) in rad, Z-Y-X, with pitch in [-pi/2, pi/2]."""
+    """Roll phi, pitch theta, yaw psi (..., 3) in rad, Z-Y-X, with pitch in [-pi/2, pi/2], of `quaternion` (..., 4)."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
@@ -42,7 +42,7 @@ def euler_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
 
 
 def quaternion_from_euler(euler: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4) of roll, pitch, yaw (..., 3) in rad, Z-Y-X."""
+    """Unit quaternions (..., 4) of `euler` (..., 3): roll, pitch, yaw in rad, Z-Y-X."""
     half = 0.5 * np.asarray(euler, dtype=float)
     (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)
     return np.stack(
@@ -57,34 +57,34 @@ def quaternion_from_euler(euler: np.ndarray) -> np.ndarray:
 
 
 def heading_from_world(vector: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-    """World vectors (..., 3) expressed in the heading frame: the world turned by `yaw` (...) about z."""
+    """World vectors `vector` (..., 3) expressed in the heading frame: the world turned by `yaw` (...) rad about z."""
     x, y, z = np.moveaxis(np.asarray(vector, dtype=float), -1, 0)
     c, s = np.cos(yaw), np.sin(yaw)
     return np.stack([c * x + s * y, -s * x + c * y, z + 0.0 * c], -1)
 
 
 def world_from_heading(vector: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-    """Heading-frame vectors (..., 3) expressed in the world."""
+    """Heading-frame vectors `vector` (..., 3) expressed in the world, which is turned back by `yaw` (...) rad."""
     return heading_from_world(vector, -np.asarray(yaw))
 
 
 def wrap_angle(angle: np.ndarray) -> np.ndarray:
-    """Angles in rad wrapped to [-pi, pi)."""
+    """Angles `angle` (...) in rad wrapped to [-pi, pi)."""
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
 
 
 def enu_from_ned(vector: np.ndarray) -> np.ndarray:
-    """NED vectors (..., 3) in ENU. The map is its own inverse."""
+    """NED vectors `vector` (..., 3) in ENU. The map is its own inverse."""
     return np.asarray(vector, dtype=float)[..., [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
 
 
 def flu_from_frd(vector: np.ndarray) -> np.ndarray:
-    """FRD body vectors (..., 3) in FLU. The map is its own inverse."""
+    """FRD body vectors `vector` (..., 3) in FLU. The map is its own inverse."""
     return np.asarray(vector, dtype=float) * np.array([1.0, -1.0, -1.0])
 
 
 def enu_flu_from_ned_frd(quaternion: np.ndarray) -> np.ndarray:
-    """Attitude (FLU body to ENU world) of an attitude given as FRD body to NED world. Its own inverse."""
+    """Attitude (..., 4), FLU body to ENU world, of `quaternion` (..., 4), FRD body to NED world. Its own inverse."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
     # q_enu_flu = q_ned->enu * q * q_flu->frd, with q_ned->enu = (0, 1, 1, 0)/sqrt(2) and q_flu->frd = (0, 1, 0, 0)
     r = np.sqrt(0.5)

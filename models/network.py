@@ -81,7 +81,7 @@ class Network:
 
 
 def propagate(layers: Sequence[Layer], x: Array) -> Array:
-    """Normalised inputs (N, F) through the layers, with rectified linear units between: (N, 3)."""
+    """Normalised inputs `x` (N, F) through the `layers`, with rectified linear units between: (N, 3)."""
     xp = array_namespace(x)
     for index, (weights, biases) in enumerate(layers):
         if index:
@@ -102,7 +102,8 @@ def error_acceleration_of(network: Network, features: Array) -> Array:
 
 
 def folded_layers(network: Network, names: Sequence[str]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The layers (float32) for raw features in the order of `names`, with all scaling inside: what is deployed.
+    """The layers, weights (K, F) and biases (K,) in float32, for raw features in the order of `names`, with all scaling
+    inside: what is deployed.
 
     Features that the network does not know get weights of zero. Raises `InputError` where one that it needs is not
     among `names`.

@@ -108,8 +108,8 @@ def is_number(value: object) -> bool:
 
 
 def numbers(value: object, shape: tuple[int | None, ...]) -> np.ndarray | None:
-    """Nested lists of finite numbers as an array of this shape (None: any length); None where they are anything
-    else."""
+    """Nested lists of finite numbers, `value`, as an array of this `shape`, (N, 3) as (None, 3); None where they are
+    anything else."""
     if not shape:
         return np.array(float(value)) if is_number(value) else None  # type: ignore[arg-type]
     if not isinstance(value, list | tuple) or shape[0] not in (None, len(value)):
@@ -123,7 +123,7 @@ def numbers(value: object, shape: tuple[int | None, ...]) -> np.ndarray | None:
 
 
 def shown(value: object, most: int = 60) -> str:
-    """A value of a damaged file for a message, however long it is."""
+    """A `value` of a damaged file for a message, in at most `most` characters, however long it is."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # a number of more digits than Python prints

@@ -97,7 +97,8 @@ def rotor_thrust(flight: Flight) -> np.ndarray | None:
 
 
 def motion_of_features(columns: Mapping[str, Array], vehicle: Vehicle) -> Motion:
-    """The features (28) of `models.contract`, each (N,), as effects see them: no history, so no delay and no lag."""
+    """The features (28) of `models.contract`, `columns` each (N,), of a `vehicle` as effects see them: no history, so
+    no delay and no lag."""
     thrust = columns["T"] / vehicle.mass
     xp = array_namespace(thrust)
     zero, one = 0.0 * thrust, 0.0 * thrust + 1.0
@@ -189,7 +190,7 @@ def rotor_torque(motion: Motion) -> Array:
 
 
 def to_heading(motion: Motion, body: Array) -> Array:
-    """Body vectors (N, 3) in the heading frame."""
+    """Body vectors `body` (N, 3) in the heading frame of the `motion`."""
     xp, r = array_namespace(motion.thrust), motion.rotation
     x, y, z = body[:, 0], body[:, 1], body[:, 2]
     return xp.stack([r[:, i, 0] * x + r[:, i, 1] * y + r[:, i, 2] * z for i in range(3)], axis=-1)

@@ -110,7 +110,8 @@ class FlightRecorder:
         self._disk.sync()
 
     def tick(self, tick: Tick | bytes, vehicle_time_us: int, host_time_ns: int) -> None:
-        """Enqueue a tick (message, or its serialised bytes where the caller has them already)."""
+        """Enqueue a `tick` (message, or its serialised bytes where the caller has them already), of `vehicle_time_us`
+        on the vehicle's clock (us) and `host_time_ns` on the computer's (ns)."""
         self._put(
             0, vehicle_time_us, host_time_ns, tick if isinstance(tick, bytes) else tick.SerializeToString()
         )
@@ -120,7 +121,7 @@ class FlightRecorder:
         self._put(1, event.vehicle_time_us, event.host_time_ns, event.SerializeToString())
 
     def close(self, timeout: float = 10.0) -> None:
-        """Write what is queued and the index, and close the file. Idempotent."""
+        """Write what is queued and the index, and close the file, within `timeout` s. Idempotent."""
         if self._thread.is_alive():
             with contextlib.suppress(queue.Full):  # its thread gave up in this moment
                 self._queue.put(None, timeout=timeout)
@@ -427,7 +428,7 @@ _VECTORS = (
 
 
 def tick_columns(ticks: Iterable[Tick]) -> dict[str, np.ndarray]:
-    """Columns of ticks, as described in `FlightRecord`."""
+    """Columns of `ticks` (N), each (N,) or (N, k), as described in `FlightRecord`."""
     ticks = list(ticks)
     columns: dict[str, np.ndarray] = {}
     for name, kind in _SCALARS.items():

@@ -114,7 +114,7 @@ def trajectory(name: str, /, **parameters: float | str) -> Trajectory:
 
 
 def check_duration(seconds: float, where: str) -> None:
-    """Raise `InputError` for a flight that is too long; false for NaN as well."""
+    """Raise `InputError`, which names `where`, for a flight of too many `seconds`, or of NaN."""
     if not seconds <= LONGEST:
         raise InputError(f"{where} takes {seconds:.4g} s; at most {LONGEST:g} s are flown at once")
 

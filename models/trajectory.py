@@ -266,7 +266,8 @@ def hold(at: Waypoint, duration: float) -> Polynomial:
 
 
 def min_jerk(begin: Waypoint, end: Waypoint, duration: float) -> Polynomial:
-    """Minimum-jerk transfer from rest to rest (Flash and Hogan 1985, equation 2)."""
+    """Minimum-jerk transfer of `duration` s from rest at `begin` to rest at `end` (Flash and Hogan 1985, equation
+    2)."""
     rows = []
     for a, b in zip(begin, end, strict=True):
         d = b - a
@@ -277,8 +278,8 @@ def min_jerk(begin: Waypoint, end: Waypoint, duration: float) -> Polynomial:
 def transfer_time(
     begin: Waypoint, end: Waypoint, speed: float, acceleration: float, yaw_rate: float = 1.5
 ) -> float:
-    """Duration in s of a minimum-jerk transfer that keeps below `speed`, `acceleration` and `yaw_rate`
-    (rad/s).
+    """Duration in s of a minimum-jerk transfer from `begin` to `end` that keeps below `speed` (m/s), `acceleration`
+    (m/s²) and `yaw_rate` (rad/s).
     """
     distance = math.dist(begin[:3], end[:3])
     turn = abs(end[3] - begin[3])
@@ -291,7 +292,8 @@ def transfer_time(
 
 
 def transfer(begin: Waypoint, end: Waypoint, speed: float, acceleration: float) -> Trajectory:
-    """A trajectory that goes straight from one waypoint to another, turning the shorter way."""
+    """A trajectory straight from `begin` to `end`, turning the shorter way, below `speed` (m/s) and `acceleration`
+    (m/s²)."""
     turn = (end[3] - begin[3] + math.pi) % (2 * math.pi) - math.pi
     end = (*end[:3], begin[3] + turn)
     return Trajectory("transfer", (min_jerk(begin, end, transfer_time(begin, end, speed, acceleration)),))
@@ -300,7 +302,8 @@ def transfer(begin: Waypoint, end: Waypoint, speed: float, acceleration: float) 
 def path(
     waypoints: Sequence[Waypoint], speed: float, acceleration: float, pause: float = 0.0
 ) -> list[Segment]:
-    """Minimum-jerk transfers from waypoint to waypoint, with a `pause` (s) at each but the first."""
+    """Minimum-jerk transfers from waypoint to waypoint of `waypoints`, below `speed` (m/s) and `acceleration` (m/s²),
+    with a `pause` (s) at each but the first."""
     segments: list[Segment] = []
     for begin, end in pairwise(waypoints):
         segments.append(min_jerk(begin, end, transfer_time(begin, end, speed, acceleration)))
@@ -310,8 +313,8 @@ def path(
 
 
 def quintic(duration: float, begin: Sequence[Sequence[float]], end: Sequence[Sequence[float]]) -> Polynomial:
-    """Quintic Hermite segment; `begin` and `end` hold value, first and second derivative of each of four
-    channels.
+    """Quintic Hermite segment of `duration` s; `begin` and `end` hold value, first and second derivative of each of
+    four channels.
     """
     rows, d = [], duration
     for (p0, v0, a0), (p1, v1, a1) in zip(begin, end, strict=True):

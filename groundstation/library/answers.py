@@ -79,8 +79,8 @@ class Comparison(results.Comparison):
     """One model against one flight of N samples, heading frame: `measured`, `predicted` and `residual` (N, 3) are
     accelerations in m/s² behind the same low-pass of `bandwidth` Hz; `used` (N,) marks the samples that count.
 
-    `rms` and `noise_floor` are over all axes, m/s²; `axes` has them one by one, `horizons` the open-loop errors (m,
-    m/s).
+    `rms` and `noise_floor` are over all axes, m/s²; `label` names the model, `axes` has the errors one by one,
+    `horizons` the open-loop errors (m, m/s).
     """
 
     def summary(self) -> Summary:
@@ -188,6 +188,8 @@ class Diagnosis(results.Diagnosis):
 
     `model` is `base` with every effect found. `rms_before`, `rms_after` and `noise_floor` are over all axes in m/s²,
     behind `bandwidth` Hz; `validation_before` and `validation_after` the same on the flight held out (`held_out`).
+    `line` are the models that led to `base`, `asked_bandwidth` the Hz that were asked for (None: what the flight
+    resolves).
     """
 
     held_out: Flight | None = None
@@ -340,9 +342,9 @@ class Diagnosis(results.Diagnosis):
 
 @dataclass(frozen=True, repr=False)
 class Tracking(tracking.Tracking):
-    """A flight beside the linear behaviour expected of it, over the M samples of its missions: `position`, `expected`
-    and `reference` (M, 3) in m, world ENU; `zeta` and `expected_zeta` (M, 3) in rad; `mse` (3,) in m² and `mse_zeta`
-    (3,) in rad², per axis.
+    """A flight, named by `label`, beside the linear behaviour expected of it, over the M samples of its missions:
+    `position`, `expected` and `reference` (M, 3) in m, world ENU; `zeta` and `expected_zeta` (M, 3) in rad; `mse` (3,)
+    in m² and `mse_zeta` (3,) in rad², per axis.
     """
 
     def summary(self) -> Summary:
@@ -380,9 +382,9 @@ class Tracking(tracking.Tracking):
 
 @dataclass(frozen=True, repr=False)
 class Tube(bound.Tube):
-    """A flight in its predicted tube, axes x, y, z of the world: `ball` (3, 2) is the half width that it settles to (m,
-    m/s), `extent` (M, 3, 2) that along the flight, `inside` (3,) the share of time inside, `leavings` where it was
-    left.
+    """A flight, named by `label`, in its predicted tube over the M samples `t` (M,) s, axes x, y, z of the world:
+    `ball` (3, 2) is the half width that it settles to (m, m/s), `extent` (M, 3, 2) that along the flight, `inside` (3,)
+    the share of time inside, `leavings` where it was left.
     """
 
     def summary(self) -> Summary:

@@ -23,7 +23,8 @@ class Flight(columns.Flight):
     `thrust_command` (N,) of full collective, ...; a column that was not logged is None.
 
     World ENU, body FLU, quaternion w, x, y, z body to world, SI units: `models.flight.COLUMNS` lists them all.
-    `vehicle` is what its owner believes of it, `notes` what the reader had to do. Everything in trueflight that takes a
+    `vehicle` is what its owner believes of it, `notes` what the reader had to do,
+    `extra` the log's further columns. Everything in trueflight that takes a
     `models.flight.Flight` takes this one.
     """
 
@@ -85,7 +86,7 @@ class Flight(columns.Flight):
 def read(
     path: str | Path, vehicle: str | Path | Vehicle | None = None, mapping: str | Path | None = None
 ) -> Flight:
-    """Read a flight of any kind: PX4 ULog, MCAP of the companion or of ROS 2, CSV or Parquet.
+    """Read the flight at `path`, of any kind: PX4 ULog, MCAP of the companion or of ROS 2, CSV or Parquet.
 
     `vehicle` is the vehicle as you believe it to be, or its vehicle.toml; None takes the file beside the flight, or
     what a record of the companion carries. `mapping` is a TOML file that names your columns and their units; None takes
@@ -104,10 +105,10 @@ def read_all(
     vehicle: str | Path | Vehicle | None = None,
     mapping: str | Path | None = None,
 ) -> list[Flight]:
-    """Read several flights: files, and every flight of folders, in the order of their names.
+    """Read several flights: of `paths` the files, and every flight of folders, in the order of their names.
 
-    `vehicle` and `mapping` as for `read`, for all of them. Raises `InputError` as `read` does, and for a folder without
-    flights.
+    `vehicle` and `mapping` as for `read`, for all of them; columns in SI units. Raises `InputError` as `read` does, and
+    for a folder without flights.
     """
     from trueflight.groundstation.reading.several import flights_in
 

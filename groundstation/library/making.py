@@ -55,7 +55,7 @@ class Training:
 
 
 def effects(directory: str | Path | None = None) -> dict[str, Effect]:
-    """The catalogue of effects by name: parameters with units, what excites each, what it is confounded with, source.
+    """The catalogue of effects by name: parameters in SI units, what excites each, its confounders, its source.
 
     `directory` is a folder of your own effects, one file each, beside those of trueflight. Raises `InputError` for a
     file there that is no effect.

@@ -13,8 +13,9 @@ from trueflight.models import model as versions
 class Model(versions.Model):
     """A model of one vehicle: the hover linearisation, `terms` (effects with fitted values) and a `network`.
 
-    `vehicle` is the one it was made for, `version` its number in a store (0: not saved), `fit` the figures of its fit
-    (residual RMS in m/s²). Everything in trueflight that takes a `models.model.Model` takes this one.
+    `vehicle` is the one it was made for, `name` and `version` what it is in a store (version 0: not saved), `created`
+    when, `fit` the figures of its fit (residual RMS in m/s²). `effects_directory` is the folder of its own effects,
+    None where all are trueflight's. Everything in trueflight that takes a `models.model.Model` takes this one.
     """
 
     @property

@@ -10,6 +10,8 @@ from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
 def formula(motion: Motion, *, loss_1: Array, loss_2: Array, loss_3: Array, loss_4: Array) -> Motion:
     """`f_i' = (1 - loss_i) f_i` of rotor i: its torque about the centre of mass and its thrust are lost together.
 
+    `loss_1`, `loss_2`, `loss_3` and `loss_4` are shares, 0 to 1, in the order of the vehicle's rotor_positions.
+
     Where nothing tells the rotors apart, the rotor is believed to be driven so much harder that roll, pitch and yaw
     stay balanced, and the thrust of all is `4 (1 - loss) / (4 - 3 loss)` of the commanded.
     """
