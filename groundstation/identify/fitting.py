@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from scipy import optimize, stats
@@ -34,9 +35,32 @@ BLOCK = 5.0
 """s of each held-out block."""
 
 
+class Sampled(Protocol):
+    """Something measured at the times `t` (M,) in s, of which `used` (M,) are compared."""
+
+    @property
+    def t(self) -> np.ndarray:
+        """Times of all samples (M,), s."""
+
+    @property
+    def used(self) -> np.ndarray:
+        """Which of them are compared (M,)."""
+
+
+class Measured(Protocol):
+    """What can be fitted: the used samples of all `measurements`, one after the other, are its K rows."""
+
+    @property
+    def measurements(self) -> Sequence[Sampled]:
+        """The flights, in the order of the rows."""
+
+    def unit(self) -> float:
+        """Squared error worth one independent sample."""
+
+
 @dataclass(frozen=True)
 class FreeParameter:
-    """One free number of a fit: a parameter of an effect, its start and its bounds."""
+    """One free number of a fit: a parameter of an effect, its start and its bounds; `flat` where it has no prior."""
 
     effect: str
     parameter: Parameter
@@ -46,10 +70,13 @@ class FreeParameter:
     neutral: float
     tolerance: float = 0.0
     nuisance: bool = False
+    flat: bool = False
 
     @property
     def spread(self) -> float:
         """Standard deviation of the prior: two typical sizes, or half the range where no value is "no effect"."""
+        if self.flat:
+            return np.inf
         if self.parameter.structural:
             return 0.5 * (self.parameter.high - self.parameter.low)
         return max(2.0 * abs(self.parameter.typical - self.neutral), 1e-6)
@@ -364,7 +391,7 @@ def _jacobian(
 
 
 def robust_covariance(
-    problem: Problem, jacobian: np.ndarray, residual: np.ndarray, prior: np.ndarray
+    problem: Measured, jacobian: np.ndarray, residual: np.ndarray, prior: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Newey-West sandwich covariance (P, P) of least squares with `jacobian` (K, A, P), `residual` (K, A) and weights
     `prior` (P,) of the prior's rows, and its fixed-b factor for 95 %."""
@@ -387,7 +414,7 @@ def robust_covariance(
     return covariance, critical_value(seconds)
 
 
-def variance_per_independent_sample(problem: Problem, residual: np.ndarray) -> float:
+def variance_per_independent_sample(problem: Measured, residual: np.ndarray) -> float:
     """Variance of `residual` (K, A) that counts for slow regressors: Bartlett kernel of `HAC_LAG` s, mean over axes,
     and never less than the plain mean square."""
     total, offset = 0.0, 0

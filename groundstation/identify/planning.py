@@ -32,7 +32,7 @@ from trueflight.groundstation.identify.fitting import (
     shifted_clock,
     variance_per_independent_sample,
 )
-from trueflight.groundstation.identify.translation import STRONG_EVIDENCE
+from trueflight.groundstation.identify.search import STRONG_EVIDENCE
 from trueflight.groundstation.measured.measurement import Measurement, measure
 from trueflight.groundstation.results import Diagnosis
 from trueflight.models.design import Design

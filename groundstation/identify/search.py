@@ -1,0 +1,381 @@
+"""Which effects are missing: one search, whatever they are seen in.
+
+Forward selection over the candidates with a backward check after every step. A candidate is screened by its
+linearisation at the current optimum; the best are fitted in full, given everything already in the model. It stays only
+if it is significant under autocorrelated residuals, matters in size, predicts held-out blocks better and has a
+physically plausible value. Where no candidate helps, one that was found may be exchanged for another. Afterwards every
+effect found is exchanged for each of its rivals: where the exchange costs nothing, the data cannot tell them apart.
+
+What is measured, and how effects act on it, is a `Problem`: the specific force (`identify.translation`) or the angular
+acceleration (`identify.rotation`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy import stats
+
+from trueflight.groundstation.identify.fitting import (
+    Fit,
+    Measured,
+    block_errors,
+    variance_per_independent_sample,
+)
+from trueflight.models.effect import Effect, Parameter
+
+FAMILY = 0.01
+"""Probability that any effect at all is significant by chance, shared by all candidates (Bonferroni)."""
+MATERIAL_SHARE = 0.01
+"""Smallest part of the remaining squared error that an effect must take away on held-out blocks."""
+SURE_TO_SEE = 0.8
+"""Power below which a flight is said not to have excited an effect."""
+SCREENED = 3
+"""Acceptable candidates fitted in full at each step, the most promising first."""
+STRONG_EVIDENCE = 6.0
+"""Twice the log likelihood ratio from which one explanation is told from another (Kass & Raftery 1995)."""
+LINEARISED = 2.0
+"""Factor that the linearised gain of an effect is trusted to, before a full fit is saved by it."""
+MOST_EFFECTS = 6
+
+
+@dataclass(frozen=True, order=True)
+class Choice:
+    """An effect as a candidate, with the names of those of its parameters that act: all of them, or the one of an
+    `exclusive` effect."""
+
+    effect: str
+    parameters: tuple[str, ...]
+
+
+def whole(effect: Effect) -> Choice:
+    """The effect with all of its parameters."""
+    return Choice(effect.name, tuple(p.name for p in effect.parameters))
+
+
+@dataclass(frozen=True)
+class State:
+    """Effects on the way to a diagnosis, fitted together; `cv` (B,) squared errors on held-out blocks."""
+
+    choices: tuple[Choice, ...]
+    fit: Fit
+    cv: np.ndarray
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its effects, in the order in which they were added."""
+        return tuple(c.effect for c in self.choices)
+
+    @property
+    def cv_total(self) -> float:
+        """Squared error on all held-out blocks."""
+        return float(self.cv.sum())
+
+
+class Problem(Measured, Protocol):
+    """Something measured, K samples of A axes, and the effects that may explain it."""
+
+    @property
+    def effects(self) -> Mapping[str, Effect]:
+        """Every effect by name, those in the model included."""
+
+    @property
+    def included(self) -> tuple[str, ...]:
+        """Names of the effects that are in the model already."""
+
+    @property
+    def choices(self) -> tuple[Choice, ...]:
+        """The candidates that this flight has the measurements for."""
+
+    @property
+    def settled(self) -> tuple[Choice, ...]:
+        """Candidates that something else has shown: the search begins with them, and nothing stands in for them."""
+
+    @property
+    def blocks(self) -> np.ndarray:
+        """Number of the held-out block of each sample (K,)."""
+
+    def fit(self, choices: tuple[Choice, ...], near: Fit | None) -> Fit:
+        """The model with `choices`, all of them fitted; `near` is the fit of some of them, to start from."""
+
+    def linearised_gain(self, here: Fit, step: tuple[Choice, ...]) -> float:
+        """Reduction of the squared error by a step, linearised at the optimum `here`."""
+
+    def contribution(self, here: Fit, choice: Choice, through: str | None = None) -> np.ndarray:
+        """What the choice at its typical size adds to the prediction, (K A, P), one column each parameter; `through`
+        is an effect that must act, at its typical size, for this one to act."""
+
+    def beside(self, here: Fit, choice: Choice) -> Fit | None:
+        """The choice beside all that is fitted `here`, linearised; None where only a fit in full tells."""
+
+    def matters(self, with_: State, without: State, step: tuple[Choice, ...]) -> bool:
+        """Whether what the step adds is large enough to be of interest."""
+
+    def visible(self, energy: float) -> bool:
+        """Whether a squared sum over all samples is large enough to be of interest."""
+
+    def held_out_error(self, fitted: Fit) -> float | None:
+        """Squared error on a flight held out of every fit; None without one."""
+
+
+def sizes(effect: Effect, choice: Choice | None = None) -> list[Parameter]:
+    """The parameters (of a choice) that say how much of the effect there is."""
+    return [
+        p for p in effect.parameters if not p.structural and (choice is None or p.name in choice.parameters)
+    ]
+
+
+def evidence(problem: Measured, for_: Fit, against: Fit) -> float:
+    """Evidence for one fit against another with as many effects, on the scale of twice a log likelihood ratio: squared
+    error in units of one independent sample, and the distance of the parameters from "no effect"."""
+    unit = variance_per_independent_sample(problem, for_.residual)
+    return (against.sse - for_.sse) / unit + against.prior_penalty - for_.prior_penalty
+
+
+def plausible(fitted: Fit, name: str) -> bool:
+    """Whether the interval of each parameter of the effect reaches into its physical range."""
+    for i in fitted.of(name):
+        _, high = fitted.interval(i)
+        p, x = fitted.free[i].parameter, fitted.estimate[i]
+        if high < p.low or x > p.high + 1e-9 or (p.low != 0.0 and x < p.low - 1e-9):
+            return False
+    return True
+
+
+def gain(with_: State, without: State) -> float:
+    """Part of the remaining squared error on held-out blocks that `with_` takes away."""
+    return (without.cv_total - with_.cv_total) / with_.cv_total
+
+
+def _score(state: State) -> float:
+    """Held-out error with a small price on every further effect, so that of two equal models the smaller wins."""
+    return state.cv_total * (1.0 + MATERIAL_SHARE) ** len(state.choices)
+
+
+class Search:
+    """One search: states are kept by their set of choices, for the steps visit many sets again.
+
+    `tried` is the number of candidates that share the risk of a chance find, where it is not that of `problem`.
+    """
+
+    def __init__(
+        self, problem: Problem, progress: Callable[[str], None] = lambda _: None, tried: int | None = None
+    ) -> None:
+        self.problem, self.progress = problem, progress
+        self.significance = FAMILY / max(1, len(problem.choices) if tried is None else tried)
+        self._states: dict[frozenset[Choice], State] = {}
+
+    def state(self, choices: Sequence[Choice]) -> State:
+        """The model with `choices`, all of them fitted."""
+        key = frozenset(choices)
+        if key not in self._states:
+            near = max((k for k in self._states if k <= key), key=len, default=frozenset())
+            fitted = self.problem.fit(tuple(choices), self._states[near].fit if near else None)
+            self._states[key] = State(tuple(choices), fitted, block_errors(fitted, self.problem.blocks))
+        return self._states[key]
+
+    def select(self) -> State:
+        """The effects that are missing."""
+        current = self._backward(self.state(self.problem.settled))
+        visited = {frozenset(current.choices)}
+        while len(current.choices) < MOST_EFFECTS:
+            self.progress(f"{len(current.choices)} effects found, looking for the next")
+            following = self._forward(current) or self._exchange(current)
+            if following is None:
+                break
+            following = self._backward(following)
+            if frozenset(following.choices) in visited:
+                break
+            visited.add(frozenset(following.choices))
+            current = following
+        return self._agreed_by_held_out(current)
+
+    def settle(self, choices: Sequence[Choice]) -> State:
+        """The fit of `choices`, without those that this flight does not support."""
+        return self._agreed_by_held_out(self._backward(self.state(choices)))
+
+    # --- the steps ------------------------------------------------------------------------------------------
+
+    def _steps(self, current: State) -> Iterator[tuple[Choice, ...]]:
+        """What may be added at once: one effect, or two where the one acts only through the other."""
+        present = {*self.problem.included, *current.names}
+        for choice in self.problem.choices:
+            if choice.effect in present:
+                continue
+            needed = self.problem.effects[choice.effect].acts_through
+            if not needed or present & set(needed):
+                yield (choice,)
+            else:
+                yield from ((c, choice) for n in needed for c in self.problem.choices if c.effect == n)
+
+    def _forward(self, current: State) -> State | None:
+        scored = [(self.problem.linearised_gain(current.fit, step), step) for step in self._steps(current)]
+        scored.sort(reverse=True)
+        best: State | None = None
+        accepted = 0
+        for promise, step in scored:
+            if accepted == SCREENED or promise < MATERIAL_SHARE * current.fit.sse:
+                break
+            candidate = self.state((*current.choices, *step))
+            if not self._acceptable(candidate, current, step):
+                continue
+            if not all(self._shows(candidate, c) for c in step):
+                continue
+            accepted += 1
+            if best is None or _score(candidate) < _score(best):
+                best = candidate
+        return best
+
+    def _exchange(self, current: State) -> State | None:
+        """The best state with one effect exchanged for another that explains the flight evidently better."""
+        best: State | None = None
+        for choice in current.choices:
+            for rival in self._standing_in(current, choice):
+                other = self.state((*(c for c in current.choices if c != choice), rival))
+                if (
+                    self.evident(other, best or current)
+                    and other.cv_total < (best or current).cv_total
+                    and all(plausible(other.fit, n) for n in other.names)
+                    and self._shows(other, rival)
+                ):
+                    best = other
+        return best
+
+    def _backward(self, current: State) -> State:
+        """Drop what the others have made superfluous, the least useful first."""
+        while True:
+            weakest = None
+            for choice in current.choices:
+                without = self.without(current, choice)
+                useful = (
+                    gain(current, without) > MATERIAL_SHARE
+                    and current.fit.wald(choice.effect) < self.significance
+                    and self.evident(current, without)
+                    and plausible(current.fit, choice.effect)
+                )
+                if not useful and (weakest is None or without.cv_total < weakest.cv_total):
+                    weakest = without
+            if weakest is None:
+                return current
+            current = weakest
+
+    def without(self, current: State, choice: Choice) -> State:
+        """The state without the choice, and without those that act only through it."""
+        rest = [c for c in current.choices if c != choice]
+        present = {*self.problem.included, *(c.effect for c in rest)}
+        return self.state([c for c in rest if self._acts(c, present)])
+
+    def _acts(self, choice: Choice, present: Iterable[str]) -> bool:
+        """Whether one of the effects that it acts through is present, if it acts through any."""
+        needed = self.problem.effects[choice.effect].acts_through
+        return not needed or not set(needed).isdisjoint(present)
+
+    def _agreed_by_held_out(self, current: State) -> State:
+        """Drop effects that predict the held-out flight worse than the model without them."""
+        while current.choices:
+            here = self.problem.held_out_error(current.fit)
+            if here is None:
+                break
+            others = [self.without(current, choice) for choice in current.choices]
+            errors = [(self.problem.held_out_error(other.fit) or 0.0, other) for other in others]
+            worse = [e for e in errors if e[0] < here * (1.0 - MATERIAL_SHARE)]
+            if not worse:
+                break
+            current = min(worse, key=lambda e: e[0])[1]
+        return current
+
+    # --- rivals ---------------------------------------------------------------------------------------------
+
+    def rivals(self, current: State, choice: Choice) -> tuple[str, ...]:
+        """Effects that could stand in for `choice` at no cost."""
+        found: list[str] = []
+        for rival in self._standing_in(current, choice):
+            if rival.effect == choice.effect or rival.effect in found:
+                continue
+            other = self.state((*(c for c in current.choices if c != choice), rival))
+            if not plausible(other.fit, rival.effect):
+                continue
+            equal = evidence(self.problem, current.fit, other.fit) < STRONG_EVIDENCE
+            if equal and self.evident(other, self.without(current, choice)):
+                found.append(rival.effect)
+        return tuple(found)
+
+    def _standing_in(self, current: State, choice: Choice) -> Iterator[Choice]:
+        """Candidates that could take the place of one that was found, by their linearisation."""
+        if choice in self.problem.settled:
+            return
+        rest = [c for c in current.choices if c != choice]
+        present = {*self.problem.included, *(c.effect for c in rest)}
+        for rival in self.problem.choices:
+            if rival == choice or rival.effect in {c.effect for c in rest} or not self._acts(rival, present):
+                continue
+            if not all(self._acts(c, {*present, rival.effect}) for c in rest):
+                continue
+            if not self._cannot_stand_in(current, choice, rival):
+                yield rival
+
+    def _cannot_stand_in(self, current: State, choice: Choice, rival: Choice) -> bool:
+        """Whether the linearised rival takes away so little of what the choice does that no fit need be made."""
+        without = self.without(current, choice)
+        lost = without.fit.sse - current.fit.sse
+        unit = variance_per_independent_sample(self.problem, current.fit.residual)
+        near = LINEARISED * self.problem.linearised_gain(without.fit, (rival,))
+        return near < lost and (lost - near) / unit > LINEARISED * STRONG_EVIDENCE
+
+    # --- what is enough -------------------------------------------------------------------------------------
+
+    def _acceptable(self, candidate: State, current: State, step: tuple[Choice, ...]) -> bool:
+        return (
+            gain(candidate, current) > MATERIAL_SHARE * len(step)
+            and self.problem.matters(candidate, current, step)
+            and all(candidate.fit.wald(c.effect) < self.significance for c in step)
+            and self.evident(candidate, current)
+            and all(plausible(candidate.fit, n) for n in candidate.names)
+        )
+
+    def evident(self, with_: State, without: State) -> bool:
+        """Whether the evidence for `with_` pays for its further parameters (two each, as Akaike's criterion)."""
+        price = 2.0 * (len(with_.fit.free) - len(without.fit.free))
+        return evidence(self.problem, with_.fit, without.fit) > STRONG_EVIDENCE + price
+
+    def _shows(self, candidate: State, choice: Choice) -> bool:
+        """Whether the flight tells the effect from the simpler ones it may coincide with: at its typical size beyond
+        them, or at its fitted size better than they do in its place."""
+        problem = self.problem
+        among = {*problem.included, *(c.effect for c in problem.choices)}
+        simpler = [
+            whole(problem.effects[n]) for n in problem.effects[choice.effect].generalises if n in among
+        ]
+        if not simpler:
+            return True
+        mine = problem.contribution(candidate.fit, choice).sum(axis=1)
+        theirs = np.column_stack([problem.contribution(candidate.fit, c) for c in simpler])
+        rest = mine - theirs @ np.linalg.lstsq(theirs, mine, rcond=None)[0]
+        if self._power(candidate, float(np.sum(rest**2)), choice) > SURE_TO_SEE:
+            return True
+        if any(c.effect in {*candidate.names, *problem.included} for c in simpler):
+            return False
+        others = [c for c in candidate.choices if c != choice]
+        return self.evident(candidate, self.state((*others, *simpler)))
+
+    def excited(self, current: State, choice: Choice, through: str | None = None) -> bool:
+        """Whether this flight would have shown the choice at its typical size, beside what is being fitted."""
+        mine = self.problem.contribution(current.fit, choice, through).sum(axis=1)
+        fitted = current.fit.jacobian.reshape(len(mine), -1)
+        if fitted.shape[1]:
+            mine = mine - fitted @ np.linalg.lstsq(fitted, mine, rcond=None)[0]
+        energy = float(np.sum(mine**2))
+        power = self._power(current, energy, choice)
+        return bool(
+            self.problem.visible(energy) and power > SURE_TO_SEE and energy > MATERIAL_SHARE * current.fit.sse
+        )
+
+    def _power(self, current: State, energy: float, choice: Choice) -> float:
+        """Probability that the parameters are significant when what they change has this squared sum."""
+        count = len(sizes(self.problem.effects[choice.effect], choice))
+        threshold = stats.chi2.isf(self.significance, count) * (current.fit.critical / 1.96) ** 2
+        unit = variance_per_independent_sample(self.problem, current.fit.residual)
+        return float(stats.ncx2.sf(threshold, count, energy / unit))

@@ -1,0 +1,155 @@
+"""What a search found, in verdicts: missing, possible, not supported, not excited; with the advice that goes with each.
+
+`identify.search` finds; here it is judged what was not found, and said in words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trueflight.groundstation.identify.fitting import Fit
+from trueflight.groundstation.identify.search import Search, State
+from trueflight.groundstation.results import EffectVerdict, ParameterEstimate
+from trueflight.models.effect import Effect
+
+MISSING, POSSIBLE, NOT_SUPPORTED, NOT_EXCITED, INCLUDED = (
+    "missing", "possible", "not_supported", "not_excited", "included",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What shares are shares of: the squared error `before` over all samples, of the model as it was.
+
+    `told` puts a share into words, in the unit of what is measured; `seen_in` as in `EffectVerdict`.
+    """
+
+    before: float
+    told: Callable[[float], str]
+    seen_in: str = "acceleration"
+
+
+def judge(
+    search: Search,
+    current: State,
+    figures: Fit,
+    scale: Scale,
+    also: Callable[[str], tuple[str, ...]] = lambda _: (),
+) -> tuple[list[EffectVerdict], list[EffectVerdict]]:
+    """Verdicts on what was found, the largest first, and on the other candidates, in the order of the catalogue.
+
+    `figures` is the fit that values and p-values are taken from, `also` names what else an effect may stand for.
+    """
+    rivals = {c: search.rivals(current, c) for c in current.choices}
+    lost = {c: search.without(current, c).fit.sse - current.fit.sse for c in current.choices}
+    ranked = sorted(((size / scale.before, choice) for choice, size in lost.items()), reverse=True)
+    found = []
+    for rank, (share, choice) in enumerate(ranked, 1):
+        effect, same = search.problem.effects[choice.effect], rivals[choice]
+        found.append(
+            EffectVerdict(
+                effect.name,
+                POSSIBLE if same else MISSING,
+                rank,
+                float(np.clip(share, 0.0, 1.0)),
+                figures.wald(effect.name),
+                estimates(figures, effect.name),
+                (*same, *effect.aliases, *also(effect.name)),
+                _tell(same, effect) if same else _add(effect),
+                scale.seen_in,
+            )
+        )
+    absent = dict.fromkeys(c.effect for c in search.problem.choices if c.effect not in current.names)
+    stood_for = {n: [c.effect for c, same in rivals.items() if n in same] for n in absent}
+    return found, [_absent(search, current, scale, n, stood_for[n]) for n in absent]
+
+
+def _absent(
+    search: Search, current: State, scale: Scale, name: str, stands_for: Sequence[str]
+) -> EffectVerdict:
+    problem = search.problem
+    effect, own = problem.effects[name], [c for c in problem.choices if c.effect == name]
+    present, through = {*problem.included, *current.names}, None
+    if effect.acts_through and not present & set(effect.acts_through):
+        carriers = [c for n in effect.acts_through for c in problem.choices if c.effect == n]
+        if not carriers:
+            return unmeasured(effect, ())
+        through = carriers[0].effect
+        tried = [search.state((*current.choices, carriers[0], c)).fit for c in own]
+    else:
+        tried = [problem.beside(current.fit, c) or search.state((*current.choices, c)).fit for c in own]
+    extended = min(tried, key=lambda f: f.sse)
+    share, p = (current.fit.sse - extended.sse) / scale.before, extended.wald(name)
+
+    def verdict(word: str, figures: Fit, rivals: Sequence[str], advice: str) -> EffectVerdict:
+        told = estimates(figures, name)
+        return EffectVerdict(name, word, None, share, p, told, tuple(rivals), advice, scale.seen_in)
+
+    if stands_for:
+        # as a stand-in for the effect found, not beside it
+        swapped = [
+            search.state([c if n.effect == stands_for[0] else n for n in current.choices]).fit for c in own
+        ]
+        return verdict(POSSIBLE, min(swapped, key=lambda f: f.sse), stands_for, _tell(stands_for, effect))
+    if not all(search.excited(current, c, through) for c in own):
+        return verdict(NOT_EXCITED, extended, (), f"to see it, fly {effect.manoeuvre}")
+    seen = p < search.significance and share > 0.0
+    return verdict(
+        NOT_SUPPORTED, extended, (), f"seen, but too small to matter here{scale.told(share)}" if seen else ""
+    )
+
+
+def by_weight(verdicts: Sequence[EffectVerdict]) -> list[EffectVerdict]:
+    """Verdicts on what was not found: the possible first, then the most significant."""
+    return sorted(verdicts, key=lambda v: (v.verdict != POSSIBLE, v.p_value))
+
+
+def included(name: str) -> EffectVerdict:
+    """The verdict on an effect of the model itself."""
+    return EffectVerdict(name, INCLUDED, None, 0.0, 0.0, (), (), "")
+
+
+def unmeasured(effect: Effect, missing: Sequence[str]) -> EffectVerdict:
+    """The verdict on an effect whose measurements the flight lacks."""
+    needed = ", ".join(missing) or ("a flight that turns" if effect.rotational else "measurements")
+    through = f" and one of {', '.join(effect.acts_through)} in the model" if effect.acts_through else ""
+    hidden = (
+        "; without them the rate controller's integral hides its torque"
+        if effect.rotational and effect.needs_any
+        else ""
+    )
+    advice = f"needs {needed}{through}{hidden}; record it, and fly {effect.manoeuvre}"
+    seen_in = "rotation" if effect.rotational else "acceleration"
+    return EffectVerdict(effect.name, NOT_EXCITED, None, 0.0, 1.0, (), (), advice, seen_in)
+
+
+def also_possible(verdict: EffectVerdict, rivals: tuple[str, ...]) -> EffectVerdict:
+    """A verdict where effects that this flight could not show would look the same."""
+    advice = f"{verdict.advice}; to tell it from {', '.join(rivals)}, fly quick vertical steps as well"
+    return replace(verdict, verdict=POSSIBLE, indistinguishable_from=rivals, advice=advice)
+
+
+def estimates(fitted: Fit, name: str) -> tuple[ParameterEstimate, ...]:
+    """The parameters of an effect with their intervals; an axis that the flight does not measure has none."""
+    return tuple(
+        ParameterEstimate(
+            fitted.free[i].parameter.name,
+            float(fitted.estimate[i]),
+            *fitted.interval(i),
+            fitted.free[i].parameter.unit,
+        )
+        for i in fitted.of(name)
+        if np.any(fitted.jacobian[:, :, i])
+    )
+
+
+def _tell(others: Sequence[str], effect: Effect) -> str:
+    return f"to tell it from {', '.join(others)}, fly {effect.manoeuvre}"
+
+
+def _add(effect: Effect) -> str:
+    alias = f"; no flight can tell it from {', '.join(effect.aliases)}" if effect.aliases else ""
+    return f"add it: groundstation model add {effect.name}{alias}"
