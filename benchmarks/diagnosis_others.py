@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from trueflight.groundstation.identify.fitting import BLOCK, Problem
+from trueflight.groundstation.identify.fitting import BLOCK, MeasuredFlights
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.measured.measurement import measure
 from trueflight.groundstation.reading import read_flight
@@ -78,7 +78,7 @@ class Columns:
     each column, and the `target` (K A,): what exact rotation leaves."""
 
     def __init__(self, flight: Flight) -> None:
-        self.problem = problem = Problem((measure(flight),))
+        self.problem = problem = MeasuredFlights((measure(flight),))
         self.body = (effect_named("rigid_body"), {})
         base = problem.predict([self.body])
         self.target = (problem.measured() - base).ravel()

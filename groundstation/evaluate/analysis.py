@@ -18,7 +18,7 @@ from trueflight.groundstation.evaluate.compare import compare
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.evaluate.tracking import Tracking, missions, track
 from trueflight.groundstation.evaluate.where import where_it_fails
-from trueflight.groundstation.identify.fitting import Problem, fit, model_of
+from trueflight.groundstation.identify.fitting import MeasuredFlights, fit, model_of
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.measured.measurement import measure
 from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
@@ -189,7 +189,9 @@ def steps_to(diagnosis: Diagnosis, bandwidth: float | None = None) -> list[Model
         through = {n: effect_named(n, base.effects_directory).acts_through for n in waiting}
         order.append(next((n for n in waiting if not through[n] or present & set(through[n])), waiting[0]))
         waiting.remove(order[-1])
-    problem = Problem((measure(diagnosis.flight, bandwidth),), base.effects_directory, base.network_chain())
+    problem = MeasuredFlights(
+        (measure(diagnosis.flight, bandwidth),), base.effects_directory, base.network_chain()
+    )
     steps = []
     for count in range(1, len(order)):
         terms = [*base.terms, *(Term(name, {}) for name in order[:count])]

@@ -83,7 +83,7 @@ class FreeParameter:
 
 
 @dataclass(frozen=True)
-class Problem:
+class MeasuredFlights:
     """Measured flights and, for each, the motion that effects act on.
 
     `always` acts in every prediction and is never fitted: the network of a model.
@@ -244,7 +244,7 @@ def free_parameters(
 
 
 def fit(
-    problem: Problem,
+    problem: MeasuredFlights,
     terms: Sequence[Term],
     refit: Sequence[str] | None = None,
     clock: bool = True,
@@ -442,7 +442,7 @@ def with_clock(measurement: Measurement, chain: Chain) -> Chain:
     """
     if any(effect.shifts_clock for effect, _ in chain):
         return chain
-    problem = Problem((measurement,))
+    problem = MeasuredFlights((measurement,))
     believed, period = problem.vehicle.command_delay, measurement.flight.dt
     measured = problem.measured()
 

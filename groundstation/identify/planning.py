@@ -25,7 +25,7 @@ from trueflight.groundstation.identify.fitting import (
     HAC_LAG,
     SCALE,
     UNMODELLED,
-    Problem,
+    MeasuredFlights,
     critical_value,
     fit,
     free_parameters,
@@ -430,7 +430,7 @@ class _Study:
         if diagnosis is None:
             return float(UNMODELLED**2 * HAC_LAG + 0.05**2 / RATE)
         m = measure(diagnosis.flight, diagnosis.bandwidth)
-        problem = Problem((m,), self.directory, diagnosis.model.network_chain())
+        problem = MeasuredFlights((m,), self.directory, diagnosis.model.network_chain())
         fitted = fit(problem, list(diagnosis.model.terms), refit=[])
         return variance_per_independent_sample(problem, fitted.residual) * float(np.median(np.diff(m.t)))
 
@@ -440,7 +440,7 @@ class _Study:
         """Where each column stands, and the weight of each parameter's prior, by its spread."""
         at = 0
         spread: list[float] = []
-        motion = Problem((_still(self.vehicle),), self.directory).survey
+        motion = MeasuredFlights((_still(self.vehicle),), self.directory).survey
         period = 1.0 / RATE
 
         def places(names: Sequence[str], values: Sequence[dict[str, float]]) -> list[int]:
@@ -475,7 +475,7 @@ class _Study:
     def information(self, flight: Flight) -> np.ndarray:
         """Inner products (C, C) of all columns over a flight, in units of the evidence."""
         m = measure(flight)
-        problem = Problem((m,), self.directory)
+        problem = MeasuredFlights((m,), self.directory)
         period = float(np.median(np.diff(m.t)))
         settled: list[tuple[Effect, dict[str, float]]] = [
             (self.known[t.effect], dict(t.values)) for t in self.settled

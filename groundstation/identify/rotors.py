@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from trueflight.groundstation.identify.fitting import HAC_LAG, UNMODELLED, Problem
+from trueflight.groundstation.identify.fitting import HAC_LAG, UNMODELLED, MeasuredFlights
 from trueflight.models.effect import Effect
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -24,7 +24,7 @@ NEAR_HOVER = (0.8, 1.2)
 
 
 @dataclass(frozen=True)
-class RotorProblem(Problem):
+class MeasuredRotors(MeasuredFlights):
     """Flights whose measured side is the specific thrust that the squares of the rotor speeds are proportional to."""
 
     def predict(self, chain: Sequence[tuple[Effect, dict[str, float]]]) -> np.ndarray:  # type: ignore[override]

@@ -7,26 +7,22 @@ between command and rotors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from trueflight.groundstation.identify.fitting import (
     Fit,
-    Problem,
-    fit,
-    free_parameters,
+    MeasuredFlights,
     model_of,
-    robust_covariance,
-    with_clock,
 )
+from trueflight.groundstation.identify.force import ForceProblem, mean_square_before
 from trueflight.groundstation.identify.rates import judge_rates
 from trueflight.groundstation.identify.remainder import unexplained
 from trueflight.groundstation.identify.rotation import RotationalFindings, judge_rotation
-from trueflight.groundstation.identify.rotors import RotorProblem, has_rotor_speeds
-from trueflight.groundstation.identify.search import Choice, Search, State, evidence, sizes, whole
+from trueflight.groundstation.identify.rotors import MeasuredRotors, has_rotor_speeds
+from trueflight.groundstation.identify.search import Search, State
 from trueflight.groundstation.identify.verdicts import (
     MISSING,
     NOT_EXCITED,
@@ -39,14 +35,11 @@ from trueflight.groundstation.identify.verdicts import (
 )
 from trueflight.groundstation.measured.measurement import Measurement, measure
 from trueflight.groundstation.results import Diagnosis, EffectVerdict
-from trueflight.models.effect import Effect, Stage
-from trueflight.models.effects import catalogue
+from trueflight.models.effect import Stage
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model, Term
 
-MATERIAL_ACCELERATION = 0.02
-"""m/s² RMS; smaller effects are within the bias stability of a MEMS accelerometer (2 mg)."""
 LONG, PART = 240.0, 20.0
 """s of flight beyond which effects are looked for in parts of so many s, as much altogether, spread evenly; what is
 found is fitted to all of the flight and dropped where that does not support it."""
@@ -66,8 +59,8 @@ def diagnose(
     Raises `InputError` where the flight lacks the columns for any comparison, or is too short.
     """
 
-    def measured(*measurements: Measurement) -> Problem:
-        return Problem(measurements, base.effects_directory, base.network_chain())
+    def measured(*measurements: Measurement) -> MeasuredFlights:
+        return MeasuredFlights(measurements, base.effects_directory, base.network_chain())
 
     all_of_it = measured(measure(flight, bandwidth))
     held_out = None if validation is None else measured(measure(validation, bandwidth))
@@ -98,7 +91,7 @@ def _on_the_way(problem: ForceProblem) -> tuple[Term, ...]:
     """
     base, flights = problem.base, problem.flights
     path = ForceProblem(
-        RotorProblem(flights.measurements, base.effects_directory),
+        MeasuredRotors(flights.measurements, base.effects_directory),
         base,
         only=lambda effect: effect.before_rotors,
         beside_all=tuple(n for n, e in problem.effects.items() if e.scales_rotors and n not in base.names()),
@@ -121,217 +114,6 @@ def _spread(flight: Flight, bandwidth: float | None) -> tuple[Measurement, ...]:
     return tuple(found)
 
 
-@dataclass(frozen=True)
-class ForceProblem:
-    """The specific force of `flights` against a model and more effects: the `Problem` of a search.
-
-    `turning` are the effects found in the rotation: they act on the thrust, too, and are not fitted to it once more.
-    `on_the_way` are those that rotor speeds have shown to act before the rotors, `beside_all` those fitted in every
-    state without being judged, `only` tells which effects are looked for.
-    """
-
-    flights: Problem
-    base: Model
-    held_out: Problem | None = None
-    turning: tuple[Term, ...] = ()
-    on_the_way: tuple[Term, ...] = ()
-    beside_all: tuple[str, ...] = ()
-    only: Callable[[Effect], bool] = lambda _: True
-
-    @cached_property
-    def effects(self) -> Mapping[str, Effect]:
-        """Every effect by name."""
-        return catalogue(self.base.effects_directory)
-
-    @cached_property
-    def included(self) -> tuple[str, ...]:
-        """Names of the effects of the model."""
-        return self.base.names()
-
-    @cached_property
-    def choices(self) -> tuple[Choice, ...]:
-        """The effects that the flights have the measurements for."""
-        return tuple(
-            whole(e)
-            for n, e in self.effects.items()
-            if n not in self.included and self._measurable(e) and self.only(e)
-        )
-
-    @property
-    def settled(self) -> tuple[Choice, ...]:
-        """What rotor speeds have shown."""
-        return tuple(whole(self.effects[t.effect]) for t in self.on_the_way)
-
-    @property
-    def flight(self) -> Flight:
-        """The flight, or its first part."""
-        return self.flights.measurements[0].flight
-
-    @property
-    def measurements(self) -> tuple[Measurement, ...]:
-        """As in `identify.fitting.Measured`."""
-        return self.flights.measurements
-
-    @cached_property
-    def blocks(self) -> np.ndarray:
-        """Number of the held-out block of each sample (K,)."""
-        return self.flights.blocks()
-
-    @cached_property
-    def samples(self) -> int:
-        """Samples times axes."""
-        return int(self.flights.measured().size)
-
-    def unit(self) -> float:
-        """As in `identify.fitting.Measured`."""
-        return self.flights.unit()
-
-    @cached_property
-    def mean_square_before(self) -> float:
-        """Mean squared error of the base model as it stands, (m/s²)²."""
-        return _mean_square_before(self.flights, self.base)
-
-    def _measurable(self, effect: Effect) -> bool:
-        if effect.rotational or (effect.stage is Stage.SENSOR and not self.flight.accelerometer):
-            return False
-        return bool(effect.parameters) and not effect.lacks(self.flight)
-
-    def at_rest(self, effect: Effect) -> dict[str, float]:
-        """Parameter values without effect, placed where it would act on this flight."""
-        placed = effect.typical(self.flights.survey)
-        neutral = effect.neutral(self.flights.vehicle)
-        return {p.name: placed[p.name] if p.structural else neutral[p.name] for p in effect.parameters}
-
-    # --- fitting --------------------------------------------------------------------------------------------
-
-    def fit(self, choices: tuple[Choice, ...], near: Fit | None) -> Fit:
-        """The base model with `choices`, all of `choices` fitted, begun at `near`."""
-        start = {} if near is None else {t.effect: t.values for t in near.terms}
-        added = [c.effect for c in choices]
-        free = (*self.beside_all, *added)
-        terms = [*self.base.terms, *self.turning, *(Term(n, start.get(n, {})) for n in free)]
-        terms = self._placed(terms, added)
-        fitted = fit(self.flights, terms, refit=free)
-        if through := [n for n in added if self.effects[n].acts_through]:
-            # what acts through another can balance it far from the best fit: begin once more from "none of it"
-            other = fit(self.flights, self._anew(terms, through), refit=free)
-            fitted = other if evidence(self, other, fitted) > 0.0 else fitted
-        return fitted
-
-    def _anew(self, terms: list[Term], through: Sequence[str]) -> list[Term]:
-        """`terms` with the effects `through` at none of it, and those that they act through at their typical size."""
-        carriers = {n for name in through for n in self.effects[name].acts_through} - set(self.included)
-        values = {n: self.effects[n].typical(self.flights.survey) for n in carriers}
-        values |= {n: self.at_rest(self.effects[n]) for n in through}
-        return [replace(t, values=values.get(t.effect, t.values)) for t in terms]
-
-    def _placed(self, terms: list[Term], added: Sequence[str]) -> list[Term]:
-        """`terms` with those effects that may end in a wrong optimum begun where they explain most."""
-        for name in added:
-            if (starts := self.effects[name].starts_for) is None:
-                continue
-            tried = [
-                [replace(t, values=dict(place)) if t.effect == name else t for t in terms]
-                for place in (
-                    *(t.values for t in terms if t.effect == name and t.values),
-                    *starts(self.flights.survey),
-                )
-            ]
-            terms = min(tried, key=self._start_error)
-        return terms
-
-    def _start_error(self, terms: list[Term]) -> float:
-        """Squared error before any fit; effects without a value yet at none of it."""
-        chain = [(self.effects[t.effect], t.values or self.at_rest(self.effects[t.effect])) for t in terms]
-        return float(np.sum((self.flights.measured() - self.flights.predict(chain)) ** 2))
-
-    # --- linearised -----------------------------------------------------------------------------------------
-
-    def linearised_gain(self, here: Fit, step: tuple[Choice, ...]) -> float:
-        """Reduction of the squared error by the step, linearised at the current optimum and at its typical size, at the
-        best of the places where it may act."""
-        starts = self.effects[step[-1].effect].starts_for
-        places = [] if starts is None else starts(self.flights.survey)
-        return max(self._gain_at(here, step, place) for place in ({}, *places))
-
-    def _gain_at(self, here: Fit, step: tuple[Choice, ...], place: Mapping[str, float]) -> float:
-        values = {t.effect: dict(t.values) for t in here.terms}
-        chain = [(self.effects[n], v) for n, v in values.items()]
-        base = self.flights.measured() - here.residual
-        columns = []
-        for choice in step:
-            effect = self.effects[choice.effect]
-            at = {p.name: place[p.name] for p in effect.parameters if p.structural and p.name in place}
-            neutral = dict(values.get(effect.name, self.at_rest(effect))) | at
-            rest = [(e, v) for e, v in chain if e.name != effect.name]
-            for p in sizes(effect):
-                moved = {**neutral, p.name: p.typical if p.typical != neutral[p.name] else p.typical * 1.5}
-                prediction = self.flights.predict([*rest, (effect, moved)])
-                columns.append((prediction - base).ravel())
-            chain = [*rest, (effect, effect.typical(self.flights.survey) | at)]
-            base = self.flights.predict(chain) if len(step) > 1 else base
-        matrix = np.column_stack([here.jacobian.reshape(self.samples, -1), *columns])
-        residual = here.residual.ravel()
-        solution = np.linalg.lstsq(
-            matrix.T @ matrix + 1e-9 * np.eye(matrix.shape[1]), matrix.T @ residual, rcond=None
-        )[0]
-        return float(residual @ matrix @ solution)
-
-    def contribution(self, here: Fit, choice: Choice, through: str | None = None) -> np.ndarray:
-        """What the effect at its typical size changes in the predicted specific force, (K A, P): one column each."""
-        values = {t.effect: dict(t.values) for t in here.terms}
-        effect = self.effects[choice.effect]
-        if through is not None:
-            values[through] = self.effects[through].typical(self.flights.survey)
-        rest = [(self.effects[n], v) for n, v in values.items() if n != effect.name]
-        neutral = self.at_rest(effect)
-        base = self.flights.predict([*rest, (effect, neutral)])
-        moved = ({**neutral, p.name: p.typical} for p in sizes(effect))
-        return np.column_stack([(self.flights.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
-
-    def beside(self, here: Fit, choice: Choice) -> Fit | None:
-        """The effect beside all that is fitted, by one Gauss-Newton step from the present optimum; None for an effect
-        on the history of the command or one that acts by its square, which are far from linear."""
-        effect = self.effects[choice.effect]
-        if effect.stage is Stage.COMMAND or any(p.even for p in effect.parameters):
-            return None
-        rest = self.at_rest(effect)
-        own = [f for f in free_parameters(effect, self.flights.survey) if not f.parameter.structural]
-        free = (*here.free, *own)
-        scale = np.array([f.parameter.typical - rest[f.parameter.name] for f in own])
-        columns = -self.contribution(here, choice) / scale
-        jacobian = np.concatenate([here.jacobian, columns.reshape(*here.residual.shape, len(own))], axis=2)
-        start = np.concatenate([here.estimate, [rest[f.parameter.name] for f in own]])
-        weight = np.sqrt(self.unit()) / np.array([f.spread for f in free])
-        flat = jacobian.reshape(self.samples, -1)
-        pull = weight**2 * (start - np.array([f.neutral for f in free]))
-        step = -np.linalg.solve(flat.T @ flat + np.diag(weight**2), flat.T @ here.residual.ravel() + pull)
-        residual = here.residual + jacobian @ step
-        covariance, critical = robust_covariance(self.flights, jacobian, residual, weight)
-        return Fit(here.terms, free, start + step, covariance, critical, jacobian, residual)
-
-    # --- what is enough -------------------------------------------------------------------------------------
-
-    def matters(self, with_: State, without: State, step: tuple[Choice, ...]) -> bool:
-        """Whether the step takes away more than `MATERIAL_ACCELERATION`, RMS, on held-out blocks."""
-        size = np.sqrt(max(without.cv_total - with_.cv_total, 0.0) / len(self.blocks))
-        return bool(size > MATERIAL_ACCELERATION)
-
-    def visible(self, energy: float) -> bool:
-        """Whether it is more than `MATERIAL_ACCELERATION`, RMS."""
-        return bool(np.sqrt(energy / len(self.blocks)) > MATERIAL_ACCELERATION)
-
-    def held_out_error(self, fitted: Fit) -> float | None:
-        """Squared error on the held-out flight, (m/s²)²."""
-        if self.held_out is None:
-            return None
-        chain = [(self.effects[t.effect], t.values) for t in fitted.terms]
-        return float(np.sum((self.held_out.measured() - self.held_out.predict(chain)) ** 2))
-
-
-# --- the diagnosis ------------------------------------------------------------------------------------------------
-
-
 def _report(search: Search, found: State, everything: Search, rotation: RotationalFindings) -> Diagnosis:
     """The verdicts; figures of what was found are those of the whole flight, which `everything` sees."""
     problem, entire = _force(search), _force(everything)
@@ -352,7 +134,7 @@ def _report(search: Search, found: State, everything: Search, rotation: Rotation
         noise_floor=min(float(np.sqrt(np.mean(m.noise[list(m.axes)] ** 2))), left),
         bandwidth=m.bandwidth,
         axes=m.axes,
-        validation_before=None if held_out is None else float(np.sqrt(_mean_square_before(held_out, base))),
+        validation_before=None if held_out is None else float(np.sqrt(mean_square_before(held_out, base))),
         validation_after=None
         if held_out is None or after is None
         else float(np.sqrt(after / held_out.measured().size)),
@@ -420,10 +202,3 @@ def _seen_as(problem: ForceProblem, name: str, fitted: Fit) -> tuple[str, ...]:
         and e.lacks(problem.flight)
         and all(fitted.estimate[i] < fitted.free[i].neutral for i in fitted.of(name))
     )
-
-
-def _mean_square_before(flights: Problem, base: Model) -> float:
-    """Mean squared error of the base model as it stands, nothing refitted but the clock, nothing learnt acting."""
-    chain = with_clock(flights.measurements[0], base.chain())
-    alone = [(effect, values) for effect, values in chain if effect.stage is not Stage.REMAINDER]
-    return float(np.mean((flights.measured() - flights.predict(alone)) ** 2))

@@ -9,7 +9,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from trueflight.groundstation.identify.fitting import Problem, fit, model_of
+from trueflight.groundstation.identify.fitting import MeasuredFlights, fit, model_of
 from trueflight.groundstation.identify.rotation import fit_rotation
 from trueflight.groundstation.measured.measurement import measure
 from trueflight.models.effects import EXACT_ROTATION, effect_named
@@ -143,7 +143,7 @@ def _turned(term: Term, model: Model, flights: Sequence[Flight]) -> Term:
 
 def refit(model: Model, flights: Sequence[Flight], bandwidth: float | None = None) -> Model:
     """The model with every parameter fitted anew to `flights`, beside its network where it has one."""
-    problem = Problem(
+    problem = MeasuredFlights(
         tuple(measure(f, bandwidth) for f in flights), model.effects_directory, model.network_chain()
     )
     model = model.with_terms(tuple(_turned(t, model, flights) for t in model.terms))

@@ -6,7 +6,7 @@ from scipy import signal
 
 from trueflight.groundstation.evaluate.compare import compare
 from trueflight.groundstation.evaluate.where import where_it_fails
-from trueflight.groundstation.identify.fitting import Problem, critical_value, fit
+from trueflight.groundstation.identify.fitting import MeasuredFlights, critical_value, fit
 from trueflight.groundstation.measured.measurement import measure
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -51,7 +51,7 @@ def flight(seed: int, colour: float, seconds: float = 30.0, noise: float = 0.15)
 def test_intervals_of_drag_hold_the_truth(colour: float) -> None:
     inside = []
     for seed in range(40):
-        problem = Problem((measure(flight(seed, colour)),))
+        problem = MeasuredFlights((measure(flight(seed, colour)),))
         fitted = fit(problem, [Term("rigid_body", {}), Term("rotor_drag", {})])
         inside += [low <= DRAG <= high for low, high in (fitted.interval(i) for i in fitted.of("rotor_drag"))]
     # 80 intervals; 95 % of them should hold it. Below 0.86 has a probability of 0.1 % if they do.

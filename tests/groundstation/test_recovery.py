@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trueflight.groundstation.identify.fitting import Problem, fit
+from trueflight.groundstation.identify.fitting import MeasuredFlights, fit
 from trueflight.groundstation.identify.rotors import thrust_from_rotors
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.measured.measurement import measure
@@ -215,7 +215,7 @@ def test_made_effect_is_found_and_its_interval_holds_the_truth(name: str) -> Non
     truth = specific_force(apply_effects(motion_of_flight(flight), chain))
     flight = replace(flight, specific_force=truth + flight.specific_force)
     assert diagnosis(flight).named("missing") == (name,)
-    fitted = fit(Problem((measure(flight),)), [Term("rigid_body", {}), Term(name, {})])
+    fitted = fit(MeasuredFlights((measure(flight),)), [Term("rigid_body", {}), Term(name, {})])
     for i in fitted.of(name):
         low, high = fitted.interval(i)
         assert low <= values[fitted.free[i].parameter.name] <= high

@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 from simulated import simulated
 
-from trueflight.groundstation.identify.fitting import Problem, fit
+from trueflight.groundstation.identify.fitting import MeasuredFlights, fit
 from trueflight.groundstation.identify.remainder import unexplained
 from trueflight.groundstation.identify.sparse import TERMS, effect_source, unit_of
 from trueflight.groundstation.identify.translation import diagnose
@@ -25,7 +25,7 @@ from trueflight.models.model import Term, rigid_body_model
 def remainder(flight: Flight) -> Unexplained:
     """What exact rotation alone leaves."""
     measurement = measure(flight)
-    fitted = fit(Problem((measurement,)), [Term("rigid_body", {})])
+    fitted = fit(MeasuredFlights((measurement,)), [Term("rigid_body", {})])
     return unexplained(measurement, fitted.residual)
 
 
