@@ -9,10 +9,11 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import stats
@@ -22,6 +23,9 @@ from trueflight.groundstation.reading.several import flight_files
 from trueflight.models.errors import InputError
 from trueflight.models.outside import is_number
 from trueflight.models.whole_file import whole_file
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 VERDICTS = ("missing", "possible", "not_supported", "not_excited", "included")
 
@@ -215,9 +219,17 @@ def _by_dask(
     scheduler: str | None,
     ready: Callable[[str], None],
 ) -> Iterator[Row]:
+    with _workers(jobs, memory, scheduler) as client:
+        ready(f"{len(client.scheduler_info()['workers'])} workers")
+        yield from _surveyed(client, names, task)
+
+
+@contextmanager
+def _workers(jobs: int, memory: str, scheduler: str | None) -> Iterator[Client]:
+    """A client of the scheduler, or of workers on this machine that end with it."""
     try:
         import dask
-        from distributed import Client, LocalCluster, as_completed, wait
+        from distributed import Client, LocalCluster
     except ImportError:
         raise InputError(
             "Dask is not installed; pip install 'trueflight[cluster]', or pass --jobs 1 to do without"
@@ -245,31 +257,37 @@ def _by_dask(
             "workers with 'dask worker'"
         ) from None
     try:
-        ready(f"{len(client.scheduler_info()['workers'])} workers")
-        futures = {client.submit(survey_flight, name, *task, pure=False): name for name in names}
-        suspects = []
-        for done in as_completed(list(futures)):
-            name = futures.pop(done)
-            if done.status == "finished":
-                yield done.result()
-            else:
-                suspects.append(name)
-            done.release()
-        # a worker that dies takes along what waited for it: who kills one alone is told, the others are not
-        for name in suspects:
-            alone = client.submit(survey_flight, name, *task, pure=False)
-            wait(alone)
-            if alone.status == "finished":
-                yield alone.result()
-            else:
-                path, why = Path(name), type(alone.exception()).__name__
-                row = Row(name, stamp_of(path), _day(path))
-                yield _failed(row, f"{path}: {why}: its worker did not survive it (more --memory may help)")
-            alone.release()
+        yield client
     finally:
         client.close()
         if cluster is not None:
             cluster.close()
+
+
+def _surveyed(client: Client, names: list[str], task: list[str | None]) -> Iterator[Row]:
+    """Each flight as it is done; a worker that dies takes along what waited for it: who kills one alone is told, the
+    others are not."""
+    from distributed import as_completed, wait
+
+    futures = {client.submit(survey_flight, name, *task, pure=False): name for name in names}
+    suspects = []
+    for done in as_completed(list(futures)):
+        name = futures.pop(done)
+        if done.status == "finished":
+            yield done.result()
+        else:
+            suspects.append(name)
+        done.release()
+    for name in suspects:
+        alone = client.submit(survey_flight, name, *task, pure=False)
+        wait(alone)
+        if alone.status == "finished":
+            yield alone.result()
+        else:
+            path, why = Path(name), type(alone.exception()).__name__
+            row = Row(name, stamp_of(path), _day(path))
+            yield _failed(row, f"{path}: {why}: its worker did not survive it (more --memory may help)")
+        alone.release()
 
 
 # --- the fleet ------------------------------------------------------------------------------------------------
