@@ -1,7 +1,7 @@
 """Every reason to end a flight, or to send nothing in it, by what one tick has seen.
 
-Nothing here acts: `companion.flight` does what a `Stop` says. What stands against a flight before it begins, and what
-is seen without odometry, is the director's.
+Nothing here acts: `companion.phases` does what a `Stop` says. What stands against a flight before it begins is in
+`companion.readiness`, what is seen without odometry in `companion.sortie`.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def test_an_armed_vehicle_is_left_alone(bridge: tuple[Bridge, int], tmp_path: Pa
     assert "the vehicle is armed" in result.stderr
 
 
-class TestWishes:
+class TestRequiredParameters:
     """What is wanted depends on how the vehicle is to fly."""
 
     def names(self, settings: Settings) -> set[str]:
