@@ -72,6 +72,13 @@ def imports(path: Path) -> set[str]:
     return found
 
 
+def sources(folder: Path) -> list[Path]:
+    """Every file of a folder; a rule over none of them would hold for nothing."""
+    found = sorted(folder.rglob("*.py"))
+    assert found, f"no Python in {folder}"
+    return found
+
+
 def _owner(name: str) -> str:
     """The library that a module belongs to; of our own, the folder."""
     parts = name.split(".")
@@ -80,7 +87,7 @@ def _owner(name: str) -> str:
 
 @pytest.mark.parametrize("package", sorted(ALLOWED))
 def test_a_package_imports_only_what_its_role_allows(package: str) -> None:
-    for path in sorted((ROOT / package).rglob("*.py")):
+    for path in sources(ROOT / package):
         if path.name == "record_pb2.py":
             continue
         allowed = (
@@ -95,7 +102,7 @@ def test_a_package_imports_only_what_its_role_allows(package: str) -> None:
 def modules(folder: str) -> dict[str, Path]:
     """The modules of a folder by their full names."""
     found = {}
-    for path in sorted((ROOT / folder).rglob("*.py")):
+    for path in sources(ROOT / folder):
         parts = path.relative_to(ROOT).with_suffix("").parts
         found[".".join(["trueflight", *(parts[:-1] if parts[-1] == "__init__" else parts)])] = path
     return found
@@ -145,7 +152,7 @@ def test_neither_simulator_nor_companion_sees_the_effects(package: str) -> None:
         "trueflight.models.prediction",
         "trueflight.models.export",
     )
-    for path in sorted((ROOT / package).rglob("*.py")):
+    for path in sources(ROOT / package):
         seen = {name for name in imports(path) if name.startswith(forbidden)}
         assert not seen, f"{path.relative_to(ROOT)} imports {sorted(seen)}"
 
@@ -153,7 +160,7 @@ def test_neither_simulator_nor_companion_sees_the_effects(package: str) -> None:
 def test_the_law_stands_alone_and_is_all_that_the_simulator_sees_of_the_companion() -> None:
     law = "trueflight.companion.law"
     for folder in ("companion/law", "sim_bridge"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
+        for path in sources(ROOT / folder):
             seen = {
                 n for n in imports(path) if n.startswith("trueflight.companion") and not n.startswith(law)
             }
@@ -169,7 +176,7 @@ def test_mavsdk_belongs_to_the_link() -> None:
 
 
 def test_groundstation_never_imports_the_simulator() -> None:
-    for path in sorted((ROOT / "groundstation").rglob("*.py")):
+    for path in sources(ROOT / "groundstation"):
         assert not any(n.startswith("trueflight.sim_bridge") for n in imports(path)), path
 
 

@@ -144,12 +144,15 @@ def test_mode_and_arming_are_unknown_after_two_and_a_half_seconds_without_a_word
     limit = odometry.vehicle_time_us - 2_500_000
     assert not reasons.mode_unknown(odometry, Latest(mode_time_us=limit))
     assert reasons.mode_unknown(odometry, Latest(mode_time_us=limit - 1))
+    started = odometry._replace(vehicle_time_us=1_000_000)
+    assert not reasons.mode_unknown(started, Latest(mode_time_us=0)), "an autopilot that has just started"
 
 
 def test_after_a_gap_mode_and_arming_are_unknown_until_told_again() -> None:
     reasons, odometry = ReasonsToStop(SAFETY, VOLTAGE), Watched().odometry
     before = Latest(mode_time_us=odometry.vehicle_time_us - 1)
     reasons.hear(odometry, 0.25)
+    reasons.hear(odometry._replace(overtaken=1), 0.5)
     reasons.hear(odometry._replace(overtaken=3), 1.0)
     assert not reasons.mode_unknown(odometry, before), "at the limit, and counting those overtaken, is no gap"
     reasons.hear(odometry, 0.2501)
@@ -303,6 +306,8 @@ def test_a_battery_that_stays_low_brings_it_home() -> None:
     flight.latest.battery_voltage = 11.9
     assert flight.lasting(18) == [()] * 17 + [(low,)]
     assert flight.look(phase=LANDING) == (), "it lands already"
+    flight.latest.battery_voltage = 0.5
+    assert [stop.kind for stop in flight.look()] == ["battery_low"], "however low it is"
 
 
 def test_a_voltage_that_nobody_told_is_not_low() -> None:

@@ -58,20 +58,30 @@ def test_ready_stopping_and_signs_of_life(manager: Manager) -> None:
     assert manager.heard() == ["WATCHDOG=1", "STOPPING=1"]
 
 
-@pytest.mark.parametrize(
-    "environment",
-    [
-        {},
-        {"NOTIFY_SOCKET": "/nowhere/notify", "WATCHDOG_USEC": "1000000"},
-        {"NOTIFY_SOCKET": "@abstract-and-gone", "WATCHDOG_USEC": "1000000"},
-        {"WATCHDOG_USEC": "1000000"},
-    ],
-)
-def test_without_a_manager_it_is_silent(environment: dict[str, str]) -> None:
+@pytest.mark.parametrize("environment", [{}, {"NOTIFY_SOCKET": ""}, {"WATCHDOG_USEC": "1000000"}])
+def test_without_a_manager_it_is_silent(environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "socket", lambda *arguments: pytest.fail("somebody would hear it"))
     watchdog = Watchdog(environment)
     watchdog.ready("x")
     watchdog.tick()
     watchdog.stopping()
+    assert watchdog.interval == 0.0, "nobody waits for a sign of life"
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_a_manager_that_is_gone_is_no_error_and_hears_the_next_sign_when_it_is_back(
+    abstract: bool, tmp_path: Path
+) -> None:
+    address = f"@{tmp_path}" if abstract else str(tmp_path / "notify")
+    watchdog = Watchdog({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1"})
+    watchdog.ready("x")
+    watchdog.tick()
+    watchdog.stopping()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as back:
+        back.settimeout(10.0)
+        back.bind(address.replace("@", "\0", 1))
+        watchdog.tick()
+        assert back.recv(4096) == b"WATCHDOG=1"
 
 
 def test_a_watchdog_meant_for_another_process_is_not_fed(manager: Manager) -> None:

@@ -29,6 +29,7 @@ def every(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reader, ...]:
 
 def test_whole_files_are_read(every, tmp_path: Path) -> None:
     """Otherwise the damaged ones would be refused for another reason."""
+    assert every
     for reader in every:
         path = tmp_path / f"{reader.name}{reader.suffix}"
         path.write_bytes(reader.seeds[0])

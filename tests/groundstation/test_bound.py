@@ -353,7 +353,9 @@ def test_a_flight_without_reference_is_told():
 
 
 def test_the_default_design_has_balls_too():
-    for ball in balls_of(make_design(VEHICLE)):
+    balls = balls_of(make_design(VEHICLE))
+    assert len(balls) == 3
+    for ball in balls:
         assert 0.05 < ball.position < 0.5
 
 

@@ -56,9 +56,10 @@ def test_hidden_effect_is_found(tmp_path, hidden, name, parameter, value, tolera
     assert result.named("missing") == (name,)
     assert result.rms_after < 1.25 * result.noise_floor < result.rms_before
     found = {p.name: p for p in result.effects[1].parameters}[parameter]
-    assert found.low < found.value < found.high
     if value is not None:
         assert found.value == pytest.approx(value, abs=tolerance)
+        slack = 0.005 * value  # two discretisations of one law
+        assert found.low - slack <= value <= found.high + slack
 
 
 def test_wind_is_found_with_the_drag_it_acts_through(tmp_path) -> None:

@@ -70,10 +70,10 @@ def test_a_vehicle_too_slow_for_the_bandwidth_is_told():
 def test_the_closed_loop_has_the_poles_of_the_design(design):
     a, _ = closed_loop(design)
     poles = np.linalg.eigvals(a)
-    for loop in loops(design, VEHICLE):
-        if loop.name in ("horizontal", "vertical"):
-            for pole in loop.poles:
-                assert np.abs(poles - pole).min() < 1e-6
+    of_position = [loop for loop in loops(design, VEHICLE) if loop.name in ("horizontal", "vertical")]
+    assert len(of_position) == 2
+    for pole in (pole for loop in of_position for pole in loop.poles):
+        assert np.abs(poles - pole).min() < 1e-6
 
 
 def integral_flight(design, gains, push, reference, duration):

@@ -129,12 +129,11 @@ def test_hidden_effect_is_found_and_its_interval_holds_the_truth(folder, name: s
     assert set(result.named("missing")) == ({"rotor_drag", "wind"} if name == "wind" else {name})
     assert result.named("possible") == ()
     true = effect_named(name).truth(hidden[0].parameters, flight.vehicle)
-    for parameter in verdict(result, name).parameters:
-        if parameter.name in true:
-            truth = true[parameter.name]
-            # two discretisations of one law: beyond the statistics, half a percent and the sensors' resolution
-            slack = 0.005 * abs(truth) + (0.002 if parameter.unit == "m/s^2" else 0.0)
-            assert parameter.low - slack <= truth <= parameter.high + slack, parameter
+    found = {parameter.name: parameter for parameter in verdict(result, name).parameters}
+    for parameter, truth in ((found[one], truth) for one, truth in true.items()):
+        # two discretisations of one law: beyond the statistics, half a percent and the sensors' resolution
+        slack = 0.005 * abs(truth) + (0.002 if parameter.unit == "m/s^2" else 0.0)
+        assert parameter.low - slack <= truth <= parameter.high + slack, parameter
 
 
 def test_damaged_rotor_is_named_with_its_loss_and_no_thrust_gain_beside_it(folder) -> None:

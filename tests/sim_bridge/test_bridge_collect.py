@@ -118,7 +118,8 @@ def test_flights_share_the_truth_and_have_noise_and_battery_of_their_own(
 ) -> None:
     plan = Plan(vehicle, design, trajectory("hover"), choose(["rich"], vehicle, 1), 1)
     wanted = flights(database(1, 5.0), plan)
-    assert all(flight.plan.hidden == plan.hidden for flight in wanted)
+    assert plan.hidden and [flight.plan.hidden for flight in wanted] == [plan.hidden] * len(wanted)
+    assert len(wanted) > 1
     assert len({flight.plan.seed for flight in wanted}) == len(wanted)
     assert [flight.plan.battery.charge for flight in wanted] == [flight.sortie.charge for flight in wanted]
     other = Plan(vehicle, design, trajectory("hover"), choose(["rich"], vehicle, 2), 1)
