@@ -29,6 +29,9 @@ FEATURES: dict[str, str] = {
 YAW_FEATURES: dict[str, str] = {"cos_psi": "1", "sin_psi": "1"}
 """Appended for a model that needs yaw (wind)."""
 
+LONGEST_WORD = 200
+"""Characters of metadata that are a name or a hash: they are shown to people, and stand in events and records."""
+
 # Keys of the ONNX file's custom metadata; every value is a string, lists and objects as JSON.
 KEY_CONTRACT = "trueflight.contract"  # CONTRACT_VERSION
 KEY_NAME = "name"
@@ -36,7 +39,7 @@ KEY_VERSION = "version"
 KEY_VEHICLE = "vehicle"  # {"name": str, "mass": kg, "hover_thrust": 1}
 KEY_FEATURES = "features"  # [{"name", "unit", "low", "high"}], the range seen in training
 KEY_CHAIN = "chain"  # [{"effect": name, "parameters": {name: value}}], in order
-KEY_DATA_HASH = "data_hash"
+KEY_DATA_HASH = "data_hash"  # SHA-256 of the data, of a few flights theirs with + between
 KEY_GOLDEN_FEATURES = "golden_features"  # [[F floats] x at least 3]
 KEY_GOLDEN_DELTA = (
     "golden_delta"  # [[3 floats] x as many]; the companion evaluates them again, within GOLDEN_TOLERANCE

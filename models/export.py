@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import logging
@@ -108,6 +109,8 @@ def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] |
         links.append(
             {"effect": "network", "parameters": {"hash": network.hash, "layers": list(network.widths)}}
         )
+    if len(data_hash) > contract.LONGEST_WORD:  # of many flights
+        data_hash = hashlib.sha256(data_hash.encode()).hexdigest()
     metadata = {
         contract.KEY_CONTRACT: contract.CONTRACT_VERSION,
         contract.KEY_NAME: model.name or model.label,

@@ -28,7 +28,6 @@ LOOK_ROWS = 3
 """Rows of features that a control tick asks for."""
 _TIMING_LIMIT = 0.5  # s; a model that is that slow needs no exact figure
 _RANGE_SAMPLES = 64
-_LONGEST_WORD = 200
 
 
 @dataclass(frozen=True)
@@ -210,8 +209,8 @@ def _json(meta: dict[str, str], key: str, kind: type) -> Any:
 
 def _word(meta: dict[str, str], key: str) -> str:
     """A metadata text that people are shown: short, and one line."""
-    if len(meta[key]) > _LONGEST_WORD or not meta[key].isprintable():
-        raise _Refused(f"its metadata '{key}' is not one line of at most {_LONGEST_WORD} characters")
+    if len(meta[key]) > contract.LONGEST_WORD or not meta[key].isprintable():
+        raise _Refused(f"its metadata '{key}' is not one line of at most {contract.LONGEST_WORD} characters")
     return meta[key]
 
 

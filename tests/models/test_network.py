@@ -2,6 +2,7 @@
 
 import base64
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -249,3 +250,9 @@ def test_heading_frame_of_the_features_turns_with_yaw() -> None:
     )
     a, b = (features_of_motion(motion_of_flight(f), NAMES) for f in (flight, turned))
     np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_a_model_of_many_flights_is_accepted() -> None:
+    """The hashes of four flights are longer than what a name or hash of a file may be."""
+    model = replace(rigid_body_model(VEHICLE), data_hash="+".join(f"{number:064x}" for number in range(4)))
+    assert check_model(export_onnx(model, a_flight()), VEHICLE).accepted
