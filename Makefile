@@ -6,7 +6,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 SEED ?= 7
 
-.PHONY: setup demo test lint coverage mutation wheel-test bench faults clean
+.PHONY: setup demo test test-long lint coverage mutation wheel-test bench faults clean
 
 setup: $(VENV)/.installed
 
@@ -25,6 +25,10 @@ demo: setup
 
 test: setup lint
 	$(BIN)/pytest
+
+# Studies, which take minutes each; CI runs them after `make test`.
+test-long: setup
+	$(BIN)/pytest -m long
 
 lint: setup
 	$(BIN)/ruff check .
