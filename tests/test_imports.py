@@ -44,10 +44,12 @@ ROOMS: dict[str, set[str]] = {
     "evaluate": {"results", "reading", "measured", "design", "identify"},
     "learn": {"measured", "identify", "evaluate"},
     "versions": {"reading", "measured", "identify"},
-    "output": {"results", "evaluate"},
+    "output": {"results", "reading", "design", "identify", "evaluate", "learn", "versions"},
     "views": {"results", "operate", "evaluate", "learn", "output"},
     "report": {"results", "evaluate", "output"},
-    "study": {"reading", "operate", "identify", "evaluate", "learn", "versions", "output"},
+    "study": {
+        "results", "reading", "operate", "identify", "evaluate", "learn", "versions", "output", "views", "report",
+    },
     "library": {
         "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",
         "report",

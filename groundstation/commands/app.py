@@ -5,19 +5,26 @@ from __future__ import annotations
 import typer
 
 from trueflight.groundstation.commands import (
-    analysis,
     bound,
     calibrate,
     collect,
+    compare,
+    demo,
+    deploy,
+    design,
+    diagnose,
     effect,
-    flight,
+    flights,
+    fly,
     keys,
-    pilot,
+    model,
     plan,
     remainder,
     report,
     reproduce,
+    status,
     survey,
+    track,
     train,
 )
 from trueflight.models.errors import run_command_line
@@ -31,15 +38,22 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
-flight.register(app)
-analysis.register(app)
+flights.register(app)
+design.register(app)
+track.register(app)
+compare.register(app)
+diagnose.register(app)
+effect.register(app)
+model.register(app)
+demo.register(app)
 report.register(app)
 bound.register(app)
 train.register(app)
-pilot.register(app)
+fly.register(app)
+deploy.register(app)
+status.register(app)
 collect.register(app)
 keys.register(app)
-effect.register(app)
 reproduce.register(app)
 remainder.register(app)
 plan.register(app)

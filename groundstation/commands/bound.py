@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -14,7 +14,7 @@ from trueflight.groundstation.commands.options import DesignOption, JsonOption, 
 from trueflight.models.printed import print_json
 
 if TYPE_CHECKING:
-    from trueflight.groundstation.evaluate.bound import Tube
+    pass
 
 console = Console()
 
@@ -58,6 +58,7 @@ def bound_command(
     """
     from trueflight.groundstation.evaluate.bound import predict_tube
     from trueflight.groundstation.evaluate.tracking import read_designed
+    from trueflight.groundstation.output.as_json import tube_table
     from trueflight.groundstation.output.flown import print_tube
 
     flown, believed, label = read_designed(flight, design, vehicle)
@@ -68,48 +69,8 @@ def bound_command(
 
         write_tube(rrd, tube)
     if as_json:
-        print_json(_table(tube))
+        print_json({**tube_table(tube), "recording": None if rrd is None else str(rrd)})
         return
     print_tube(console, tube)
     if rrd is not None:
         console.print(f"Rerun recording: {escape(str(rrd))}")
-
-
-def _table(tube: Tube) -> dict[str, Any]:
-    from trueflight.groundstation.output.flown import PARTS
-
-    d = tube.disturbance
-    most, inside = abs(tube.distance).max(axis=0), tube.inside
-    radii = {part: d.radius(tube.balls, part) for part in PARTS}
-    return {
-        "flight": tube.flight.origin,
-        "label": tube.label,
-        "seconds": round(len(tube.t) * tube.flight.dt, 2),
-        "around": d.around,
-        "bound_from": tube.bound_from,
-        "bandwidth": d.bandwidth,
-        "axes": {
-            axis: {
-                "P": tube.balls[k].P.tolist(),
-                "decay": tube.balls[k].decay,
-                "bound": float(tube.bound[k]),
-                "radius": float(tube.radius[k]),
-                "resolution": float(tube.resolution[k]),
-                "ball_position": float(tube.ball[k, 0]),
-                "ball_velocity": float(tube.ball[k, 1]),
-                "d": float(abs(d.total[:, k]).max()),
-                "d_over_memory": {part: float(radii[part][k]) for part in PARTS},
-                "flown_position": float(most[k, 0]),
-                "flown_velocity": float(most[k, 1]),
-                "flown_level": float(tube.level[:, k].max()),
-                "inside": float(inside[k]),
-            }
-            for k, axis in enumerate("xyz")
-        },
-        "units": {"decay": "1/s", "bound": "m/s^2", "radius": "m/s^2", "position": "m", "velocity": "m/s"},
-        "jumps": tube.jumps.tolist(),
-        "leavings": [
-            {"axis": w.axis, "start": w.start, "end": w.end, "level": w.level, "allowed": w.allowed}
-            for w in tube.leavings
-        ],
-    }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,7 +22,7 @@ from trueflight.groundstation.commands.options import (
     TimeoutOption,
     ZenohOption,
 )
-from trueflight.groundstation.commands.pilot import check_controller, link_settings, warn
+from trueflight.groundstation.output.terminal import print_warning
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json_line
 
@@ -69,16 +67,21 @@ def collect_command(
     Each flight takes off and lands. Ends early when one is not flown to its end (a pilot took over, the battery is
     low); the same command continues with the flights that are missing, on another battery for instance.
     """
-    check_controller(controller)
     from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.mission import check_controller
+    from trueflight.groundstation.operate.settings import settings_with
     from trueflight.models.database import Collection, database, record_name
 
+    check_controller(controller)
     sorties = {
         record_name(number, sortie): sortie for number, sortie in enumerate(database(seed, minutes), 1)
     }
-    settings = link_settings(config, name, connect, mode, listen, zenoh_config, cfg, timeout, keys)
+    settings = settings_with(
+        config, name=name, connect=connect, mode=mode, listen=listen, zenoh_config=zenoh_config, cfg=cfg,
+        timeout=timeout, keys=keys,
+    )  # fmt: skip
     with Link(settings) as link:
-        warn(link)
+        print_warning(link.warning)
         asked = {"vehicle": link.vehicle, "seed": seed, "minutes": minutes, "controller": controller}
         collection = Collection(output, {"flown_by": "groundstation collect", **asked})
         reason = _fly_missing(link, sorties, collection, controller, patience, as_json)
@@ -106,6 +109,8 @@ def _fly_missing(
     """Fly what the collection lacks; '' when it lacks nothing any more, otherwise what came in between."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from trueflight.groundstation.operate.collection import fly_sortie
+
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
     with Progress(
         *columns,
@@ -125,7 +130,9 @@ def _fly_missing(
                 progress.update(task, description=f"{flight}: {what}")
 
             try:
-                entry, reason = _fly(link, sortie, controller, patience, collection.folder / record, tell)
+                entry, reason = fly_sortie(
+                    link, sortie, controller, patience, collection.folder / record, tell
+                )
             except KeyboardInterrupt:
                 return f"it was interrupted (a flight under way is flown to its end: {record})"
             if reason:
@@ -133,56 +140,6 @@ def _fly_missing(
             collection.add(record, entry)
             progress.update(task, advance=sortie.path.duration)
     return ""
-
-
-def _fly(
-    link: Link, sortie: Sortie, controller: str, patience: float, record: Path, tell: Callable[[str], None]
-) -> tuple[dict[str, Any], str]:
-    """Fly one and fetch its record; its entry and '', or nothing and the reason why it was not flown to its end."""
-    voltage = link.status()["battery_voltage"]
-    request = {"trajectory": sortie.trajectory, "parameters": sortie.parameters, "controller": controller}
-    answer, reason = _requested(link, request, patience, tell)
-    if reason:
-        return {}, reason
-
-    def tell_status(status: dict[str, Any], entry: dict[str, Any]) -> None:
-        tell(f"{status['phase']}, {status['battery_voltage']:.1f} V")
-
-    ended = link.end_of(answer["mission"], tell_status, idle=True)
-    if ended["state"] != "finished":
-        return {}, f"{sortie.trajectory} was {ended['state']}: {ended['reason']}"
-    if not ended["record"]:
-        return {}, f"{sortie.trajectory} was flown without a record; look at the companion's disk"
-    tell("fetching the record")
-    link.fetch_record(ended["record"], record.parent).replace(record)
-    entry = {
-        "trajectory": sortie.trajectory,
-        "parameters": sortie.parameters,
-        "outcome": ended["state"],
-        "seconds": sortie.path.duration,
-        "voltage": voltage,
-        "on_board": ended["record"],
-    }
-    return entry, ""
-
-
-def _requested(
-    link: Link, request: dict[str, Any], patience: float, tell: Callable[[str], None]
-) -> tuple[dict[str, Any], str]:
-    """The answer to a mission that was accepted, or the reason why it was refused for all of `patience` s.
-
-    A battery that rests after a flight recovers a little, and rates are measured again on the ground.
-    """
-    end = time.monotonic() + patience
-    while True:
-        answer = link.ask("mission", request)
-        if answer.get("accepted"):
-            return answer, ""
-        reason = str(answer.get("reason", "no reason given"))
-        if time.monotonic() > end:
-            return {}, f"the companion refused {request['trajectory']}: {reason}"
-        tell(f"waiting: {reason}")
-        time.sleep(1.0)
 
 
 def _print_collected(flown: dict[str, dict[str, Any]]) -> None:

@@ -1,239 +1,112 @@
-"""The main job, end to end: fly, compare, see where, name the missing effect, add it, fly again, reveal.
-
-Simulator and companion run as processes of their own, as they would on a desk and on a vehicle; nothing here knows
-what is hidden until `sim-bridge reveal` prints it at the end.
-"""
+"""`groundstation demo`: the main job end to end, and what came of it."""
 
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
+import typer
 from rich.console import Console
-from rich.table import Table
 
-from trueflight.groundstation.evaluate.compare import compare, waterfall
-from trueflight.groundstation.evaluate.tracking import Tracking, track_file
-from trueflight.groundstation.evaluate.where import where_it_fails
-from trueflight.groundstation.identify.actuation import actuation_of
-from trueflight.groundstation.identify.translation import diagnose
-from trueflight.groundstation.operate.link import Link
-from trueflight.groundstation.operate.processes import program, running_rig
-from trueflight.groundstation.operate.settings import Settings
-from trueflight.groundstation.output.tables import (
-    SAID,
-    percent,
-    print_comparisons,
-    print_diagnosis,
-    print_waterfall,
-    print_where,
-)
-from trueflight.groundstation.reading import read_flight
-from trueflight.groundstation.results import Comparison, Diagnosis
-from trueflight.groundstation.versions.store import add_effect, lineage, save
-from trueflight.models.errors import InputError
-from trueflight.models.export import export_onnx, not_exported
-from trueflight.models.flight import Flight
-from trueflight.models.model import Model, rigid_body_model
-from trueflight.models.vehicle import QUAD5, Vehicle, load_vehicle
-from trueflight.models.whole_file import write_whole
+from trueflight.models.vehicle import QUAD5
 
-SURVEY: tuple[str, dict[str, float]] = ("excitation", {})
-TASK: tuple[str, dict[str, float]] = ("lemniscate", {"speed": 2.5, "height": 0.8})
-MARK = ".trueflight-demo"
+if TYPE_CHECKING:
+    from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
+    from trueflight.groundstation.study.demonstration import Outcome
+
+console = Console()
+# Resolved: the samples lie beside the folders, not beside the links to them.
+SAMPLES = Path(__file__).resolve().parents[2] / "samples" / "crazyflie"
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What a demonstration measured."""
-
-    folder: Path
-    diagnosis: Diagnosis
-    before: Comparison
-    after: Comparison
-    tracking: tuple[Tracking, Tracking]
-    revealed: str
-    recordings: tuple[Path, ...]
-    seconds: float
+def register(app: typer.Typer) -> None:
+    """Add this command to the ground station's application."""
+    app.command("demo")(demo_command)
 
 
-def demonstrate(
-    folder: Path, seed: int, hidden: Sequence[str], console: Console, open_viewer: bool = True
-) -> Outcome:
-    """Run the whole job in `folder` on an effect drawn from `seed` (or on the effects in `hidden`)."""
-    started = time.monotonic()
-    _make(folder)
-    vehicle = load_vehicle(QUAD5)
-    sealed = folder / "answer.sealed"
-    truth = [word for name in (hidden or ["random"]) for word in ("--hidden", name)]
-    truth += ["--seed", str(seed), "--sealed", str(sealed)]
-    with running_rig(folder, QUAD5, truth) as (endpoint, pids):
-        _step(
-            console, "Three processes", f"bridge {pids[0]}, companion {pids[1]}, ground station {os.getpid()}"
-        )
-        settings = Settings(connect=(endpoint,), name=vehicle.name)
-        with Link(settings) as link:
-            survey = _fly(console, link, folder, *SURVEY, "lqr")
-            task = _fly(console, link, folder, *TASK, "lqr")
-            model, diagnosis, before, after, recordings = _analyse(console, folder, vehicle, survey, task)
-            corrected = _deploy_and_fly(console, link, folder, model, survey)
-    _step(console, "The answer", "sim-bridge reveal")
-    revealed = _reveal(sealed, hidden)
-    console.print(f"hidden was: {revealed}", highlight=False)
-    tracking = (track_file(task), track_file(corrected))
-    recordings += _tracking_recording(folder, tracking)
-    outcome = Outcome(
-        folder, diagnosis, before, after, tracking, revealed, recordings, time.monotonic() - started
-    )
-    _summary(console, outcome)
-    if open_viewer and (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"
-    ):
-        subprocess.Popen([program("rerun"), *map(str, recordings)], start_new_session=True)
-    return outcome
+def demo_command(
+    seed: Annotated[int, typer.Option("--seed", help="Draws the hidden effect and the noise.")] = 7,
+    hidden: Annotated[
+        list[str] | None, typer.Option("--hidden", help="Hide this effect instead of a drawn one.")
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for everything it makes.")] = Path(
+        "out/demo"
+    ),
+    real: Annotated[bool, typer.Option("--real/--no-real", help="Also analyse real flights.")] = True,
+    viewer: Annotated[
+        bool, typer.Option("--viewer/--no-viewer", help="Open Rerun where there is a display.")
+    ] = True,
+) -> None:
+    """The main job end to end on a simulated vehicle with a hidden effect, then on real flights.
 
+    Example: groundstation demo --seed 7
+    """
+    from trueflight.groundstation.operate.processes import program
+    from trueflight.groundstation.study.demonstration import REAL, demonstrate, real_flights
 
-def _make(folder: Path) -> None:
-    """An empty folder; only an earlier demonstration's is emptied."""
-    mark = folder / MARK
-    if folder.exists() and any(folder.iterdir()):
-        if not mark.exists():
-            raise InputError(
-                f"{folder}: holds files that are no demonstration's; choose another folder with --output"
-            )
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(
-        mark, "made by groundstation demo, which may empty this folder\n", "the mark of a demonstration"
-    )
-
-
-def _step(console: Console, title: str, command: str) -> None:
-    console.print()
-    console.rule(f"[bold]{title}[/bold]  [dim]{command}[/dim]", align="left")
-
-
-# --- the job -----------------------------------------------------------------------------------------------------
-
-
-def _fly(
-    console: Console, link: Link, folder: Path, name: str, parameters: dict[str, float], controller: str
-) -> Path:
-    """One mission from takeoff to landing; the path of its record on the ground."""
-    _step(
-        console,
-        f"Fly {name}, controller {controller}",
-        f"groundstation fly {name} --controller {controller} --wait",
-    )
-    mission = {"trajectory": name, "parameters": parameters, "controller": controller, "repeat": 1}
-    answer = link.request("mission", mission)
-    with console.status(f"flying {name}: {answer['duration']:.0f} s and takeoff and landing"):
-        entry = link.end_of(answer["mission"])
-    if entry["state"] != "finished":
-        raise InputError(
-            f"mission {name} {entry['state']}: {entry['reason']}; see {folder / 'companion.log'}"
-        )
-    record = link.fetch_record(entry["record"], folder)
-    named = record.with_name(f"{name}-{controller}.mcap")
-    record.replace(named)
-    console.print(f"flown and fetched: {named}", highlight=False)
-    return named
-
-
-def _analyse(
-    console: Console, folder: Path, vehicle: Vehicle, survey: Path, task: Path
-) -> tuple[Model, Diagnosis, Comparison, Comparison, tuple[Path, ...]]:
-    """Compare, see where, diagnose, add what is missing. Returns the last model and what was measured."""
-    from trueflight.groundstation.evaluate.analysis import analyse
-    from trueflight.groundstation.output.as_json import analysis_table
-    from trueflight.groundstation.report import render, write_report
-    from trueflight.groundstation.views import write_analysis, write_before_after
-
-    fitted, held_out = read_flight(survey), read_flight(task)
-    base = rigid_body_model(vehicle)
-    store = folder / "models"
-    _step(console, "Compare the model with the flight", f"groundstation compare {survey.name}")
-    before = compare(fitted, base)
-    print_comparisons(console, [compare(fitted, m) for m in lineage(store, base)])
-    where = where_it_fails(before)
-    print_where(console, where)
-    _step(console, "Diagnose", f"groundstation diagnose {survey.name} --validate {task.name}")
-    diagnosis = diagnose(fitted, base, held_out)
-    print_diagnosis(console, diagnosis)
-    model, parent = base, None
-    for name in diagnosis.named("missing") or diagnosis.named("possible")[:1]:
-        _step(
-            console,
-            f"Add {name}",
-            f"groundstation model add {name} --flight {survey.name} --validate {task.name}",
-        )
-        model, path = save(store, add_effect(model, name, [fitted]), parent)
-        parent = model
-        console.print(f"new model version: {path}", highlight=False)
-    line = lineage(store, model)
-    steps = waterfall(fitted, held_out, line)
-    print_waterfall(console, steps, fitted.name, held_out.name)
-    after = compare(fitted, model)
-    recordings = folder / "analysis.rrd", folder / "before-after.rrd"
-    whole = analyse(fitted, lineage(store, base), held_out)
-    write_analysis(recordings[0], whole)
-    first, last = (compare(held_out, m, horizons=False) for m in (line[0], model))
-    write_before_after(recordings[1], first, last, steps)
-    report = folder / "report.html"
-    write_report(report, render(whole, analysis_table(whole)))
-    console.print(f"report: {report}", highlight=False)
-    return model, diagnosis, before, after, recordings
-
-
-def _deploy_and_fly(console: Console, link: Link, folder: Path, model: Model, survey: Path) -> Path:
-    """Export, deploy, and fly the task corrected."""
-    _step(console, "Deploy", "groundstation model export; groundstation deploy")
-    file = folder / "correction.onnx"
-    with console.status("exporting to ONNX"):
-        flight = read_flight(survey)
-        onnx = export_onnx(model, flight, actuation=actuation_of(model, [flight]))
-        write_whole(file, onnx, "the model", "choose another --output")
-    answer = link.request("model", file.read_bytes(), 30.0)
-    console.print(f"accepted by the companion: {answer.get('reason') or file.name}", highlight=False)
-    for effect in not_exported(model):
+    audience = _Terminal()
+    outcome = demonstrate(output, QUAD5, seed, hidden or [], audience)
+    audience.step("Before and after", str(output))
+    _print_outcome(outcome)
+    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"
+    if viewer and screen:
+        subprocess.Popen([program("rerun"), *map(str, outcome.recordings)], start_new_session=True)
+    if real and not all((SAMPLES / file).is_file() for file, _ in REAL):
         console.print(
-            f"{effect} stays on the ground: a static correction has neither memory nor a sensor, so tracking gains "
-            "only from the rest of the model",
-            style="yellow",
+            "No real flights: samples/crazyflie is in the repository, not in this installation. For a flight of your "
+            "own: groundstation diagnose FLIGHT",
+            highlight=False,
+            soft_wrap=True,
         )
-    return _fly(console, link, folder, *TASK, "corrected")
+    elif real:
+        audience.step("Real flights of Crazyflies", "groundstation diagnose samples/crazyflie/...")
+        _print_real(real_flights(SAMPLES, audience))
 
 
-def _reveal(sealed: Path, hidden: Sequence[str]) -> str:
-    if hidden:
-        return ", ".join(hidden)
-    done = subprocess.run(
-        [program("sim-bridge"), "reveal", str(sealed)], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise InputError(f"sim-bridge reveal failed: {done.stderr.strip()}")
-    return " ".join(done.stdout.split())
+class _Terminal:
+    """The audience of a demonstration: a terminal."""
+
+    def step(self, title: str, command: str) -> None:
+        """A heading."""
+        console.print()
+        console.rule(f"[bold]{title}[/bold]  [dim]{command}[/dim]", align="left")
+
+    def busy(self, text: str) -> AbstractContextManager[object]:
+        """A line that goes away."""
+        return console.status(text)
+
+    def said(self, text: str, warning: bool = False) -> None:
+        """A line."""
+        console.print(text, style="yellow" if warning else None, highlight=warning)
+
+    def compared(self, comparisons: Sequence[Comparison], where: WhereItFails) -> None:
+        """The tables of `compare`."""
+        from trueflight.groundstation.output.tables import print_comparisons, print_where
+
+        print_comparisons(console, comparisons)
+        print_where(console, where)
+
+    def diagnosed(self, diagnosis: Diagnosis) -> None:
+        """The tables of `diagnose`."""
+        from trueflight.groundstation.output.tables import print_diagnosis
+
+        print_diagnosis(console, diagnosis)
+
+    def fell(self, steps: tuple[WaterfallStep, ...], fitted: str, held_out: str) -> None:
+        """The table of `model add`."""
+        from trueflight.groundstation.output.tables import print_waterfall
+
+        print_waterfall(console, steps, fitted, held_out)
 
 
-def _tracking_recording(folder: Path, tracking: tuple[Tracking, Tracking]) -> tuple[Path, ...]:
-    from trueflight.groundstation.views import write_tracking
+def _print_outcome(o: Outcome) -> None:
+    from rich.table import Table
 
-    path = folder / "tracking.rrd"
-    write_tracking(path, tracking)
-    return (path,)
-
-
-# --- what comes out ----------------------------------------------------------------------------------------------
-
-
-def _summary(console: Console, o: Outcome) -> None:
-    _step(console, "Before and after", str(o.folder))
     table = Table(show_header=True)
     for column, side in (
         ("error", "left"),
@@ -278,37 +151,18 @@ def _summary(console: Console, o: Outcome) -> None:
     console.print(f"{o.seconds:.0f} s", style="dim")
 
 
-# Resolved: the samples lie beside the folders, not beside the links to them.
-SAMPLES = Path(__file__).resolve().parents[2] / "samples" / "crazyflie"
-REAL = (
-    ("crazyswarm2_log08.csv", "upgraded motors"),
-    ("crazyswarm2_log44.csv", "upgraded motors"),
-    ("crazyswarm2_log201.csv", "carries a payload"),
-)
-"""Real flights in the repository, and what is known of them."""
+def _print_real(found: Iterable[tuple[str, Diagnosis]]) -> None:
+    from rich.table import Table
 
+    from trueflight.groundstation.output.tables import SAID, percent
 
-def real_flights(console: Console) -> list[tuple[Flight, Diagnosis]]:
-    """The same analysis on real Crazyflie flights: what it finds, in one table."""
-    if not all((SAMPLES / file).is_file() for file, _ in REAL):
-        console.print(
-            "No real flights: samples/crazyflie is in the repository, not in this installation. For a flight of your "
-            "own: groundstation diagnose FLIGHT",
-            highlight=False,
-            soft_wrap=True,
-        )
-        return []
-    _step(console, "Real flights of Crazyflies", "groundstation diagnose samples/crazyflie/...")
     table = Table()
     for column in ("flight, and what is known", "found", "share", "parameters, 95 % interval"):
         table.add_column(column, no_wrap=column == "found", justify="right" if column == "share" else "left")
-    results = []
-    for file, known in REAL:
-        with console.status(f"diagnosing {file}"):
-            flight = read_flight(SAMPLES / file)
-            result = diagnose(flight, rigid_body_model(flight.vehicle))
-        results.append((flight, result))
-        name = f"{flight.name}: {known}\nresidual {result.rms_before:.2f} -> {result.rms_after:.3f} m/s²"
+    for known, result in found:
+        name = (
+            f"{result.flight.name}: {known}\nresidual {result.rms_before:.2f} -> {result.rms_after:.3f} m/s²"
+        )
         for e in (e for e in result.effects if e.rank):
             values = "\n".join(
                 f"{p.name} = {p.value:.3g} [{p.low:.3g}, {p.high:.3g}] {p.unit}" for p in e.parameters
@@ -320,4 +174,3 @@ def real_flights(console: Console) -> list[tuple[Flight, Diagnosis]]:
             name = ""
         table.add_section()
     console.print(table)
-    return results

@@ -1,74 +1,76 @@
-"""Command line for a user's own effects: `groundstation effect new`."""
+"""`groundstation effects` and `effect new`: the catalogue, and a user's own effects."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
+from trueflight.groundstation.commands.options import EffectsOption, JsonOption
+from trueflight.models.printed import print_json
+
+if TYPE_CHECKING:
+    from trueflight.models.effect import Effect
+
 console = Console()
 effect_app = typer.Typer(no_args_is_help=True, help="Write an effect of your own.")
-
-TEMPLATE = '''"""NAME: say in one line what it does to the vehicle."""
-
-# This file is all that trueflight knows of your effect. Ranking, fit, intervals, plots and ONNX export take it
-# from here: groundstation diagnose FLIGHT --effects DIR, where DIR is the folder of this file.
-# It works as it stands, with the weight of a tether as an example: put your own physics in its place.
-
-from array_api_compat import array_namespace
-
-from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
-
-
-def formula(motion: Motion, *, pull: Array) -> Motion:
-    """`a = -pull h z`, world z, with the height h of a tether that hangs from the vehicle."""
-    # What `motion` holds, N samples, SI units, body FLU, heading frame = world turned by yaw:
-    #   command, thrust (N,)    thrust over mass, as commanded and as it acts, m/s²
-    #   force (N, 3)            other forces over mass, body axes, m/s²
-    #   reading (N, 3)          what the accelerometer adds, body axes, m/s²
-    #   rotation (N, 3, 3)      body to heading frame; rotation[:, 2, :] is world z in body axes
-    #   body_velocity           three (N,): velocity relative to the air along the body's axes, m/s
-    #   height, voltage (N,)    above ground, m; of the battery, V
-    #   body_rate, body_acceleration (N, 3), rotor_thrust, rotor_speed (N, 4)    for effects on the rotation
-    #   vehicle                 mass, rotor_radius, rotor_positions, ... of vehicle.toml
-    # Use functions that numpy and torch share (xp.sqrt, xp.exp, xp.clip, xp.stack), no `if` on values and no loop
-    # over samples: the same function is fitted, predicts, and is exported.
-    xp = array_namespace(motion.thrust)
-    up = motion.rotation[:, 2, :]
-    size = -pull * motion.height
-    force = xp.stack([size * up[:, 0], size * up[:, 1], size * up[:, 2]], axis=-1)
-    # Return a changed motion; never write into its arrays.
-    return motion.with_(force=motion.force + force)
-
-
-EFFECT = Effect(
-    name="NAME",
-    title="weight of a tether grows with height",
-    # When it acts: COMMAND (history of the command), THRUST (its magnitude), AIR (the air's velocity), FORCE (other
-    # forces), SENSOR (the reading), TORQUE (on the rotation).
-    stage=Stage.FORCE,
-    formula=formula,
-    # Name, unit, meaning, value without effect, a size that matters in flight, plausible range. The typical size
-    # decides whether a flight could have shown the effect; a value outside the range is never called missing.
-    parameters=(Parameter("pull", "1/s^2", "weight over mass and height", 0.0, 0.1, 0.0, 2.0),),
-    # Columns of a flight that the formula reads: quaternion, position, velocity, thrust_command, battery_voltage,
-    # angular_velocity, specific_force, rotor_speed, ...
-    needs=("quaternion", "position", "thrust_command"),
-    # What to fly to see it, and what it is easily taken for.
-    manoeuvre="slow climbs and descents between 0.5 and 5 m, with a hover at each end",
-    citation="weight of the hanging length of a tether: mass per length times height times gravity",
-    confounded_with=("thrust_gain", "ground_effect", "battery_sag"),
-    # exports=False for an effect with memory: a correction on the vehicle is a static map of features.
-    # acts_through=("rotor_drag",) for one that acts only through another; docs/effects.md has the rest.
-)
-'''
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands for own effects to the ground station's application."""
+    app.command("effects")(effects_command)
     app.add_typer(effect_app, name="effect")
+
+
+def effects_command(
+    name: Annotated[str | None, typer.Argument(help="One effect, in full.")] = None,
+    effects: EffectsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The catalogue of effects: what each is, what excites it, what it is confounded with.
+
+    Example: groundstation effects ground_effect
+    """
+    from trueflight.groundstation.output.as_json import effect_table
+    from trueflight.models.effects import catalogue, effect_named
+
+    directory = None if effects is None else str(effects)
+    shown = list(catalogue(directory).values()) if name is None else [effect_named(name, directory)]
+    if as_json:
+        print_json([effect_table(e) for e in shown])
+    elif name is None:
+        _print_catalogue(shown)
+    else:
+        _print_effect(shown[0])
+
+
+def _print_catalogue(effects: Sequence[Effect]) -> None:
+    from rich.table import Table
+
+    table = Table()
+    table.add_column("effect", no_wrap=True)
+    table.add_column("what it is")
+    table.add_column("parameters")
+    for e in effects:
+        told = ", ".join(p.name if p.unit == "1" else f"{p.name} ({p.unit})" for p in e.parameters)
+        table.add_row(e.name, e.title, told)
+    console.print(table)
+
+
+def _print_effect(e: Effect) -> None:
+    console.print(f"[bold]{e.name}[/bold]: {e.title}")
+    console.print(" ".join((e.formula.__doc__ or "").split()), highlight=False, markup=False)
+    for p in e.parameters:
+        unit = "" if p.unit == "1" else f" {p.unit}"
+        console.print(f"  {p.name}: {p.meaning}, {p.low:g} to {p.high:g}{unit}")
+    either = f"{', ' if e.needs else ''}{' or '.join(e.needs_any)}" if e.needs_any else ""
+    console.print(f"needs: {', '.join(e.needs)}{either}")
+    console.print(f"fly: {e.manoeuvre}")
+    console.print(f"confounded with: {', '.join((*e.confounded_with, *e.aliases)) or e.unconfounded}")
+    console.print(f"source: {e.citation}")
 
 
 @effect_app.command("new")
@@ -80,15 +82,10 @@ def effect_new(
 
     Example: groundstation effect new tether --output my-effects
     """
+    from trueflight.groundstation.versions.effect_file import write_template
+
     path = write_template(name, output)
     console.print(f"{path}: put your formula in, then", highlight=False)
     console.print(f"  groundstation effects {name} --effects {output}", highlight=False)
     console.print(f"  groundstation diagnose FLIGHT --effects {output}", highlight=False)
     console.print(f"  groundstation model add {name} --flight FLIGHT --effects {output}", highlight=False)
-
-
-def write_template(name: str, folder: Path) -> Path:
-    """Write the template of effect `name` into `folder`; raises as `write_effect_file`."""
-    from trueflight.groundstation.versions.effect_file import write_effect_file
-
-    return write_effect_file(name, TEMPLATE.replace("NAME", name), folder)

@@ -36,6 +36,8 @@ DesignOption = Annotated[
     Path | None, typer.Option("--design", help="Design file; default: that of the record.")
 ]
 
+JobsOption = Annotated[int, typer.Option(help="Flights at a time; 0: one for each core.", min=0)]
+
 # --- what comes out -------------------------------------------------------------------------------------------------
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]

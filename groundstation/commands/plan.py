@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,14 +17,13 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
+from trueflight.groundstation.output.terminal import working
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
 from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
     from trueflight.groundstation.identify.planning import FlightPlan
-    from trueflight.models.design import Design
-    from trueflight.models.vehicle import Vehicle
 
 console = Console()
 
@@ -73,64 +70,28 @@ def plan_command(
     """
     from trueflight.groundstation.identify.planning import Limits, plan_flight, setpoints
     from trueflight.groundstation.identify.translation import diagnose
-    from trueflight.groundstation.output.as_json import plain
+    from trueflight.groundstation.output.as_json import plan_table
     from trueflight.groundstation.reading import read_flight
-    from trueflight.groundstation.versions.choice import choose_start
+    from trueflight.groundstation.versions.choice import choose_start, design_to_fly
     from trueflight.models.vehicle import load_vehicle
 
+    if flight is None and vehicle is None:
+        raise InputError("pass a flight, or --vehicle with --between")
     limits = Limits(radius, low, high, speed, acceleration, duration)
     directory = None if effects is None else str(effects)
-    diagnosis = None
-    with nullcontext() if as_json else console.status("reading") as status:
-
-        def progress(text: str) -> None:
-            if status is not None:
-                status.update(text)
-
-        if flight is not None:
-            read = read_flight(flight, vehicle, mapping)
-            believed = read.vehicle
-            base = choose_start(read, model, store, effects)
-            diagnosis = diagnose(read, base, progress=progress)
-        elif vehicle is not None:
-            believed = load_vehicle(vehicle)
-        else:
-            raise InputError("pass a flight, or --vehicle with --between")
-        gains = _design(design, believed, flight)
+    with working(console, "reading", as_json) as progress:
+        read = None if flight is None else read_flight(flight, vehicle, mapping)
+        diagnosis = None
+        if read is not None:
+            diagnosis = diagnose(read, choose_start(read, model, store, effects), progress=progress)
+        believed = load_vehicle(str(vehicle)) if read is None else read.vehicle
+        gains = design_to_fly(believed, read, design)
         plan = plan_flight(gains, believed, limits, diagnosis, between or (), directory, progress)
     write_whole(output, setpoints(plan.trajectory), "the plan", "choose another -o")
     if as_json:
-        print_json(
-            plain(
-                {
-                    "path": str(output),
-                    "duration": plan.trajectory.duration,
-                    "manoeuvres": plan.manoeuvres,
-                    "questions": [{**asdict(q), "answered": q.answered} for q in plan.questions],
-                    "precision": [asdict(p) for p in plan.precision],
-                    "left_out": plan.left_out,
-                }
-            )
-        )
+        print_json(plan_table(plan, output))
         return
     _print(plan, output)
-
-
-def _design(given: Path | None, vehicle: Vehicle, flight: Path | None) -> Design:
-    """The design that will fly: the one given, the record's own, or the one beside the vehicle file."""
-    from trueflight.models.design import load_design
-    from trueflight.models.record import read_record
-
-    if given is not None:
-        return load_design(given, vehicle)
-    if flight is not None and flight.suffix.lower() == ".mcap":
-        recorded = read_record(flight).design
-        if recorded is not None:
-            return recorded
-    beside = Path(vehicle.source).with_name("design.json") if vehicle.source else Path("design.json")
-    if not beside.is_file():
-        raise InputError(f"{beside}: no design to predict the flight by; pass --design FILE")
-    return load_design(beside, vehicle)
 
 
 def _print(plan: FlightPlan, output: Path) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -20,6 +19,7 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
+from trueflight.groundstation.output.terminal import working
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
 
@@ -56,14 +56,14 @@ def remainder_command(
     """
     from trueflight.groundstation.identify.sparse import effect_source
     from trueflight.groundstation.identify.translation import diagnose
-    from trueflight.groundstation.output.as_json import plain
+    from trueflight.groundstation.output.as_json import remainder_table
     from trueflight.groundstation.reading import read_flight
     from trueflight.groundstation.versions.choice import choose_start
     from trueflight.groundstation.versions.effect_file import write_effect_file
 
     read = read_flight(flight, vehicle, mapping)
     base = choose_start(read, model, store, effects)
-    with nullcontext() if as_json else console.status("explaining what can be explained"):
+    with working(console, "explaining what can be explained", as_json):
         result = diagnose(read, base, bandwidth=bandwidth)
     left, path = result.unexplained, None
     if write is not None:
@@ -75,21 +75,9 @@ def remainder_command(
         source = effect_source(left.formula, name, read.name, read.data_hash)
         path = write_effect_file(name, source, write)
     if as_json:
-        print_json(plain(_table(result, path)))
+        print_json(remainder_table(result, path))
         return
     _print(left, result, path, flight)
-
-
-def _table(d: Diagnosis, path: Path | None) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return {
-        "flight": d.flight.name,
-        "explained_by": list(d.model.names()),
-        "residual_rms": {"value": d.rms_after, "noise_floor": d.noise_floor, "unit": "m/s^2"},
-        "unexplained": asdict(d.unexplained),
-        "written": None if path is None else str(path),
-    }
 
 
 def _print(left: Unexplained, d: Diagnosis, path: Path | None, flight: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +11,7 @@ from rich.console import Console
 from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
     BandwidthOption,
+    DesignOption,
     EffectsOption,
     FlightArgument,
     JsonOption,
@@ -22,7 +22,7 @@ from trueflight.groundstation.commands.options import (
     ValidateOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import print_written
+from trueflight.groundstation.output.terminal import print_written, working
 from trueflight.models.printed import print_json
 
 console = Console()
@@ -48,9 +48,7 @@ def report_command(
     vehicle: VehicleOption = None,
     mapping: MappingOption = None,
     model: ModelsOption = None,
-    design: Annotated[
-        Path | None, typer.Option("--design", help="Design file, for tracking; default: that of the record.")
-    ] = None,
+    design: DesignOption = None,
     without: Annotated[
         list[str] | None, typer.Option("--without", help="Leave this section out. Repeatable.")
     ] = None,
@@ -81,10 +79,8 @@ def report_command(
     flights = told_apart([read, *(read_beside(path, read, vehicle, mapping) for path in beside or ())])
     named = [[choose_model(f, which, store, effects) for which in model or (None,)] for f in flights]
     line = choose_line(read, model[-1] if model else None, store, effects)
-    with nullcontext() if as_json else console.status("comparing") as status:
-        progress = (lambda text: None) if status is None else status.update
-        several = len(flights) > 1 or len(named[0]) > 1
-        together = side_by_side(flights, named, bandwidth) if several else None
+    with working(console, "comparing", as_json) as progress:
+        together = side_by_side(flights, named, bandwidth) if len(flights) * len(named[0]) > 1 else None
         whole = analyse(
             read, line, held_out, bandwidth, choose_design(read, design), together, progress=progress
         )

@@ -12,15 +12,12 @@ import numpy as np
 import typer
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from trueflight.groundstation.commands.options import JsonOption
-from trueflight.models.errors import InputError
-from trueflight.models.outside import read_text
+from trueflight.groundstation.commands.options import JobsOption, JsonOption, SaveOption
+from trueflight.groundstation.output.terminal import counted, print_written
 from trueflight.models.printed import print_json
 from trueflight.models.vehicle import QUAD5
-from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
     from trueflight.groundstation.study.reproduce import Prepared, Scenario, Study
@@ -58,11 +55,8 @@ def reproduce_command(
     vehicle: Annotated[
         Path, typer.Option(help="vehicle.toml with its design.json beside it.", show_default=False)
     ] = QUAD5,
-    jobs: Annotated[int, typer.Option(help="Flights at a time; 0: one for each core.", min=0)] = 0,
-    save: Annotated[
-        Path | None,
-        typer.Option("--save", "--rrd", help="Write a Rerun recording of the unseen scenario here."),
-    ] = None,
+    jobs: JobsOption = 0,
+    save: SaveOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Collect, diagnose, train and fly every controller on flights no model has seen; print the paper's Table I.
@@ -72,97 +66,34 @@ def reproduce_command(
     """
     from trueflight.groundstation.study import reproduce as r
 
-    chosen = _scenarios(scenario, r.SCENARIOS)
-    truth = [word for name in (hidden or ["rich"]) for word in ("--hidden", name)]
-    if not vehicle.is_file():
-        raise InputError(f"{vehicle}: no such vehicle file; give --vehicle")
-    output.mkdir(parents=True, exist_ok=True)
-    asked = {"hidden": hidden or ["rich"], "minutes": minutes, "vehicle": vehicle.read_text(encoding="utf-8")}
-    _same_study(output, asked)
-    flights = len(chosen) * len(r.ARMS) + 2
+    chosen = r.chosen_scenarios(scenario)
+    asked = r.Asked(output, vehicle, tuple(hidden or ["rich"]), minutes)
+    asked.open()
     real = [s for s in chosen if s.name in ("unseen", "low")] if companion else []
+    cores = jobs or len(os.sched_getaffinity(0))
     prepared, flown = [], []
-    with _bar(as_json) as progress:
-        task = progress.add_task("", total=seeds * (6 + flights + 3 * len(real)))
+    with counted(as_json) as progress:
+        task = progress.add_task("", total=seeds * (6 + len(chosen) * len(r.ARMS) + 2 + 3 * len(real)))
         for seed in range(first, first + seeds):
-            folder = output / f"vehicle-{seed}"
 
-            def tell(what: str, seed: int = seed) -> None:
-                progress.update(task, advance=1, description=f"vehicle {seed}: {what}")
+            def tell(what: str, done: int, seed: int = seed) -> None:
+                progress.update(task, advance=done, description=f"vehicle {seed}: {what}")
 
-            one = r.prepare(folder, vehicle, seed, truth, minutes, tell)
-            progress.update(task, description=f"vehicle {seed}: fly")
-            step = lambda: progress.advance(task)  # noqa: E731
-            flown += r.fly_all(
-                folder, vehicle, one, truth, chosen, jobs or len(os.sched_getaffinity(0)), step
-            )
-            progress.update(task, description=f"vehicle {seed}: fly with the companion")
-            flown += r.fly_companion(folder, vehicle, one, truth, real, step)
+            one, flights = r.one_vehicle(asked, seed, chosen, real, cores, tell)
             prepared.append(one)
+            flown += flights
     study = r.Study(tuple(flown), tuple(prepared))
     if save is not None:
-        _save(save, output / f"vehicle-{first}", chosen[0])
+        r.write_unseen(save, output / f"vehicle-{first}", chosen[0])
     if as_json:
-        print_json(_table(study, chosen))
+        print_json({**_table(study, chosen), "recording": None if save is None else str(save)})
         return
     _print(study, chosen, bool(real))
-    if save is not None:
-        console.print(f"Rerun recording: {save}", highlight=False)
-
-
-def _scenarios(names: list[str] | None, known: Sequence[Scenario]) -> list[Scenario]:
-    if not names:
-        return list(known)
-    by_name = {s.name: s for s in known}
-    for name in names:
-        if name not in by_name:
-            raise InputError(f"--scenario {name}: unknown; choose from {', '.join(by_name)}")
-    return [by_name[name] for name in dict.fromkeys(names)]
-
-
-def _same_study(output: Path, asked: dict[str, Any]) -> None:
-    """Keep what was asked in the folder; raises `InputError` where it holds another study or foreign files."""
-    import json
-
-    path = output / "study.json"
-    text = json.dumps(asked, indent=1)
-    if path.exists() and path.stat().st_size:  # empty where an earlier version was killed
-        if read_text(path, "the study", "choose another --output") != text:
-            raise InputError(f"{output}: holds another study (see {path.name}); choose another --output")
-    elif any(p != path and not p.name.startswith(".") for p in output.iterdir()):
-        raise InputError(f"{output}: holds files that are no study's; choose another --output")
-    else:
-        write_whole(path, text, "the study", "choose another --output")
-
-
-def _bar(quiet: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=Console(stderr=True),
-        disable=quiet,
-        transient=True,
-    )
-
-
-def _save(path: Path, folder: Path, scenario: Scenario) -> None:
-    from dataclasses import replace
-
-    from trueflight.groundstation.evaluate.tracking import track_file
-    from trueflight.groundstation.views import write_tracking
-
-    names = {"lqr": "lqr", "lqr-+-integral": "lqr_integral", "effects-+-network": "corrected"}
-    tracked = [
-        replace(track_file(folder / f"{scenario.name}-{stem}.mcap"), label=label)
-        for stem, label in names.items()
-    ]
-    write_tracking(path, tracked)
+    print_written(console, save)
 
 
 def _print(study: Study, scenarios: Sequence[Scenario], companion: bool) -> None:
-    from trueflight.groundstation.study.reproduce import ANATOMY, ARMS, BOTH, PAPER
+    from trueflight.groundstation.study.reproduce import ARMS
 
     for prepared in study.prepared:
         _print_prepared(prepared)
@@ -190,6 +121,25 @@ def _print(study: Study, scenarios: Sequence[Scenario], companion: bool) -> None
                 f"{_ratio(columns[0], columns[-1])}, {_ratio(columns[1], columns[-1])}",
             )
         table.add_section()
+    _paper_rows(table)
+    console.print(table)
+    for one in scenarios:
+        console.print(f"{one.name}: {one.title}", style="dim", highlight=False)
+    if companion:
+        console.print("*: by the companion over MAVLink, in real time; the others in-process", style="dim")
+    _print_parts(study, scenarios[0])
+    for f in study.flown:
+        if f.outcome != "finished" or "tripped" in f.guard:
+            console.print(
+                f"vehicle {f.seed}, {f.scenario}, {f.controller}: {f.outcome}, guard {f.guard}",
+                style="yellow",
+            )
+
+
+def _paper_rows(table: Table) -> None:
+    """The figures of the paper, to compare with."""
+    from trueflight.groundstation.study.reproduce import PAPER
+
     for where, figures in PAPER.items():
         lqr, integral, network = figures.values()
         for axis, letter in enumerate("xyz"):
@@ -203,28 +153,23 @@ def _print(study: Study, scenarios: Sequence[Scenario], companion: bool) -> None
                 style="dim",
             )
         table.add_section()
-    console.print(table)
-    for one in scenarios:
-        console.print(f"{one.name}: {one.title}", style="dim", highlight=False)
-    if companion:
-        console.print("*: by the companion over MAVLink, in real time; the others in-process", style="dim")
+
+
+def _print_parts(study: Study, scenario: Scenario) -> None:
+    """What each part of the corrected controller brings."""
+    from trueflight.groundstation.study.reproduce import ANATOMY, BOTH
+
     parts = Table(
-        title=f"what each part of the corrected controller brings, {scenarios[0].name}: MSE, m²",
+        title=f"what each part of the corrected controller brings, {scenario.name}: MSE, m²",
         box=box.SIMPLE,
     )
     parts.add_column("effects and network")
     for letter in "xyz":
         parts.add_column(letter, justify="right")
     for arm in ANATOMY:
-        mse = study.mse(scenarios[0].name, BOTH if arm is ANATOMY[-1] else arm.name)
+        mse = study.mse(scenario.name, BOTH if arm is ANATOMY[-1] else arm.name)
         parts.add_row(arm.name, *(_cell(mse[:, axis]) for axis in range(3)))
     console.print(parts)
-    for f in study.flown:
-        if f.outcome != "finished" or "tripped" in f.guard:
-            console.print(
-                f"vehicle {f.seed}, {f.scenario}, {f.controller}: {f.outcome}, guard {f.guard}",
-                style="yellow",
-            )
 
 
 def _print_prepared(prepared: Prepared) -> None:

@@ -22,6 +22,7 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
+from trueflight.groundstation.output.terminal import print_written
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
 
@@ -79,8 +80,8 @@ def train_command(
     The network learns what the linear model plus the effects of --model (default: the newest version, else
     exact rotation alone; `linear` as in the paper) do not explain of these flights.
     """
-    from trueflight.groundstation.learn.training import memory_share, recipe_named, train, with_epochs
-    from trueflight.groundstation.output.as_json import network_summary, plain
+    from trueflight.groundstation.learn.training import recipe_named, train, with_epochs
+    from trueflight.groundstation.output.as_json import training_table
     from trueflight.groundstation.versions.store import save as save_version
 
     widths, chosen = _widths(layers), with_epochs(recipe_named(recipe), epochs)
@@ -108,28 +109,12 @@ def train_command(
 
         write_training(save, done, samples, made.label)
     if as_json:
-        print_json(
-            plain(
-                {
-                    "vehicle": made.vehicle.name,
-                    "version": made.version,
-                    "parent": made.parent,
-                    "path": str(path),
-                    "flights": list(samples.flights),
-                    "left_out": list(samples.left_out),
-                    "minutes": samples.seconds / 60.0,
-                    "best_epoch": done.best,
-                    "memory_share": memory_share(samples, done),
-                    "network": network_summary(done.network),
-                    "recording": None if save is None else str(save),
-                }
-            )
-        )
+        table = training_table(made, done, samples, path)
+        print_json({**table, "recording": None if save is None else str(save)})
         return
     _print_training(done, samples, base)
     console.print(f"model version: {path}", highlight=False)
-    if save is not None:
-        console.print(f"Rerun recording: {save}", highlight=False)
+    print_written(console, save)
 
 
 def ablate_command(
@@ -187,8 +172,7 @@ def ablate_command(
         )
         return
     _print_ablation(result)
-    if save is not None:
-        console.print(f"Rerun recording: {save}", highlight=False)
+    print_written(console, save)
 
 
 # --- what goes in ---------------------------------------------------------------------------------------------------
@@ -267,12 +251,7 @@ def _bar(what: str, total: int) -> Iterator[Callable[[int, str], None]]:
 def _print_training(done: Training, samples: Samples, base: Model) -> None:
     from rich.table import Table
 
-    from trueflight.groundstation.learn.training import MATERIAL_MEMORY, memory_share
-    from trueflight.models.effect import Stage
-    from trueflight.models.effects import catalogue
-
     network, fit = done.network, done.network.fit
-    minutes = samples.seconds / 60.0
     table = Table(
         title=f"{network.label} beside {base.with_network(None).label}: remainder on held-out blocks, RMS in m/s²",
         title_justify="left",
@@ -293,6 +272,16 @@ def _print_training(done: Training, samples: Samples, base: Model) -> None:
         style="bold",
     )
     console.print(table)
+    _print_remarks(done, samples, base)
+
+
+def _print_remarks(done: Training, samples: Samples, base: Model) -> None:
+    """What was trained on, and what to know of it."""
+    from trueflight.groundstation.learn.training import MATERIAL_MEMORY, memory_share
+    from trueflight.models.effect import Stage
+    from trueflight.models.effects import catalogue
+
+    network, minutes = done.network, samples.seconds / 60.0
     console.print(
         f"{minutes:.1f} min of {len(samples.flights)} flights, {100 * done.train.mean():.0f} % trained on, "
         f"{100 * done.validation.mean():.0f} % held out; {network.parameters} parameters; {len(done.history)} epochs "

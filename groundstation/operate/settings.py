@@ -70,3 +70,16 @@ def load_settings(path: Path | None) -> Settings:
                 raise InputError(f"{path}: '{key}' must be a list of texts, not {shown(value)}")
             changes[key] = tuple(value)
     return replace(Settings(), **changes)
+
+
+def settings_with(config: Path | None, **flags: object) -> Settings:
+    """The settings of a file, overridden by flags of the same names; None, or nothing of a list, overrides nothing.
+
+    Raises `InputError` as `load_settings`.
+    """
+    given: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else str(value) if isinstance(value, Path) else value
+        for name, value in flags.items()
+        if value is not None and value != []
+    }
+    return replace(load_settings(config), **given)

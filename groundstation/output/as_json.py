@@ -4,20 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
+from trueflight.models.effect import Effect
 from trueflight.models.effects import effect_named
 from trueflight.models.model import Model
 from trueflight.models.network import Network
+from trueflight.models.outside import toml_table
 
 if TYPE_CHECKING:
+    from trueflight.groundstation.design.integral_design import IntegralLoop
+    from trueflight.groundstation.design.linear_design import Loop
     from trueflight.groundstation.evaluate.analysis import Analysis
+    from trueflight.groundstation.evaluate.bound import Tube
     from trueflight.groundstation.evaluate.calibration import Calibration, Case
     from trueflight.groundstation.evaluate.side_by_side import SideBySide
     from trueflight.groundstation.evaluate.tracking import Tracking
+    from trueflight.groundstation.identify.planning import FlightPlan
+    from trueflight.groundstation.learn.training import Training
+    from trueflight.groundstation.learn.training_data import Samples
+    from trueflight.groundstation.versions.vehicle_draft import Draft
+    from trueflight.models.design import Design
+    from trueflight.models.flight import Flight
 
 UNIT = "m/s^2"
 
@@ -249,3 +261,192 @@ def calibration_table(calibration: Calibration, cases: Sequence[Case]) -> dict[s
             "cases": [asdict(c) for c in cases],
         }
     )
+
+
+def beside_table(s: SideBySide) -> dict[str, Any]:
+    """The JSON of a page of comparisons side by side: theirs, and how to make them again."""
+    from trueflight.groundstation.evaluate.analysis import provenance
+
+    made = provenance(*(("flight", c.flight) for c in s.comparisons))
+    return {"side_by_side": side_by_side_table(s), "provenance": asdict(made)}
+
+
+def effect_table(e: Effect) -> dict[str, Any]:
+    """The JSON of an effect of the catalogue."""
+    return {
+        "name": e.name,
+        "title": e.title,
+        "formula": " ".join((e.formula.__doc__ or "").split()),
+        "parameters": {
+            p.name: {"unit": p.unit, "meaning": p.meaning, "low": p.low, "high": p.high} for p in e.parameters
+        },
+        "needs": list(e.needs),
+        "needs_any": list(e.needs_any),
+        "seen_in": "rotation" if e.rotational else "acceleration",
+        "manoeuvre": e.manoeuvre,
+        "confounded_with": list(e.confounded_with),
+        "citation": e.citation,
+        "exports": e.exports,
+    }
+
+
+def remainder_table(d: Diagnosis, written: Path | None) -> dict[str, Any]:
+    """The JSON of what no effect explains; `written` is the effect made of it."""
+    return plain(
+        {
+            "flight": d.flight.name,
+            "explained_by": list(d.model.names()),
+            "residual_rms": {"value": d.rms_after, "noise_floor": d.noise_floor, "unit": "m/s^2"},
+            "unexplained": asdict(d.unexplained),
+            "written": None if written is None else str(written),
+        }
+    )
+
+
+def plan_table(plan: FlightPlan, path: Path) -> dict[str, Any]:
+    """The JSON of a planned flight, written at `path`."""
+    return plain(
+        {
+            "path": str(path),
+            "duration": plan.trajectory.duration,
+            "manoeuvres": plan.manoeuvres,
+            "questions": [{**asdict(q), "answered": q.answered} for q in plan.questions],
+            "precision": [asdict(p) for p in plan.precision],
+            "left_out": plan.left_out,
+        }
+    )
+
+
+def tube_table(tube: Tube) -> dict[str, Any]:
+    """The JSON of a stability tube."""
+    from trueflight.groundstation.output.flown import PARTS
+
+    d = tube.disturbance
+    most, inside = abs(tube.distance).max(axis=0), tube.inside
+    radii = {part: d.radius(tube.balls, part) for part in PARTS}
+    return {
+        "flight": tube.flight.origin,
+        "label": tube.label,
+        "seconds": round(len(tube.t) * tube.flight.dt, 2),
+        "around": d.around,
+        "bound_from": tube.bound_from,
+        "bandwidth": d.bandwidth,
+        "axes": {
+            axis: {
+                "P": tube.balls[k].P.tolist(),
+                "decay": tube.balls[k].decay,
+                "bound": float(tube.bound[k]),
+                "radius": float(tube.radius[k]),
+                "resolution": float(tube.resolution[k]),
+                "ball_position": float(tube.ball[k, 0]),
+                "ball_velocity": float(tube.ball[k, 1]),
+                "d": float(abs(d.total[:, k]).max()),
+                "d_over_memory": {part: float(radii[part][k]) for part in PARTS},
+                "flown_position": float(most[k, 0]),
+                "flown_velocity": float(most[k, 1]),
+                "flown_level": float(tube.level[:, k].max()),
+                "inside": float(inside[k]),
+            }
+            for k, axis in enumerate("xyz")
+        },
+        "units": {"decay": "1/s", "bound": "m/s^2", "radius": "m/s^2", "position": "m", "velocity": "m/s"},
+        "jumps": tube.jumps.tolist(),
+        "leavings": [
+            {"axis": w.axis, "start": w.start, "end": w.end, "level": w.level, "allowed": w.allowed}
+            for w in tube.leavings
+        ],
+    }
+
+
+def training_table(made: Model, done: Training, samples: Samples, path: Path) -> dict[str, Any]:
+    """The JSON of a training, whose model version `made` was written at `path`."""
+    from trueflight.groundstation.learn.training import memory_share
+
+    return plain(
+        {
+            "vehicle": made.vehicle.name,
+            "version": made.version,
+            "parent": made.parent,
+            "path": str(path),
+            "flights": list(samples.flights),
+            "left_out": list(samples.left_out),
+            "minutes": samples.seconds / 60.0,
+            "best_epoch": done.best,
+            "memory_share": memory_share(samples, done),
+            "network": network_summary(done.network),
+        }
+    )
+
+
+def design_table(
+    design: Design, path: Path, loops: Sequence[Loop], integral: Sequence[IntegralLoop]
+) -> dict[str, Any]:
+    """The JSON of a design that was written at `path`, and of what its closed loops do."""
+    return {
+        "design": str(path),
+        "K_zeta": design.K_zeta,
+        "K_eta": design.K_eta,
+        "integral": None if design.integral is None else asdict(design.integral),
+        "loops": [_loop(loop) for loop in loops],
+        "integral_loops": [
+            {
+                **_loop(i.loop),
+                "disturbance_removed_after": i.removal,
+                "disturbance_allowed": i.allowed,
+                "disturbance_peak": i.peak,
+                "step_distance_to_lqr": i.step_distance,
+                "translation_distance_to_lqr": i.translation_distance,
+            }
+            for i in integral
+        ],
+    }
+
+
+def _loop(loop: Loop) -> dict[str, Any]:
+    return {
+        "name": loop.name,
+        "poles": [[p.real, p.imag] for p in loop.poles],
+        "crossover": loop.crossover,
+        "phase_margin_deg": loop.phase_margin,
+        "rise_time": loop.rise_time,
+        "settling_time": loop.settling_time,
+        "overshoot": loop.overshoot,
+    }
+
+
+def tracked_table(tracking: Tracking, first: Tracking) -> dict[str, Any]:
+    """The JSON of one of several tracked flights, beside the first of them."""
+    return {
+        "flight": tracking.flight.origin,
+        "label": tracking.label,
+        "seconds": round(len(tracking.t) * tracking.flight.dt, 2),
+        "mse": dict(zip("xyz", tracking.mse, strict=True)),
+        "unit": "m^2",
+        "mse_zeta": dict(zip(("roll", "pitch", "yaw"), tracking.mse_zeta, strict=True)),
+        "rms": tracking.rms,
+        "change": sum(tracking.mse) / sum(first.mse) - 1.0,
+    }
+
+
+def imported_table(flight: Flight, path: Path, vehicle: Path) -> dict[str, Any]:
+    """The JSON of a flight that was written at `path`, its vehicle beside it."""
+    from trueflight.groundstation.reading.writing import own_table
+
+    return {
+        "flight": str(path),
+        "vehicle": str(vehicle),
+        "samples": len(flight),
+        "duration": round(flight.duration, 3),
+        "columns": list(own_table(flight)),
+        "notes": list(flight.notes),
+    }
+
+
+def draft_table(draft: Draft, path: Path) -> dict[str, Any]:
+    """The JSON of a vehicle file drafted at `path`."""
+    return {
+        "vehicle_draft": str(path),
+        "values": toml_table(draft.text, str(path)),
+        "sources": {line.key: line.source for line in draft.lines},
+        "to_complete": list(draft.to_complete),
+    }

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+if TYPE_CHECKING:
+    from trueflight.models.flight import Flight
+    from trueflight.models.record_pb2 import Event
 
 
 def print_written(console: Console, recording: Path | None, report: Path | None = None) -> None:
@@ -13,3 +22,46 @@ def print_written(console: Console, recording: Path | None, report: Path | None 
         console.print(f"Rerun recording: {recording}")
     if report is not None:
         console.print(f"report: {report}")
+
+
+STYLES = {"warning": "yellow", "error": "red"}
+
+
+def print_event(console: Console, event: Event) -> None:
+    """What a companion tells."""
+    console.print(f"{event.kind}: {escape(event.text)}", style=STYLES.get(event.level, ""))
+
+
+def print_warning(warning: str) -> None:
+    """In red, beside what is printed: that anybody on the network could do the same; nothing of an empty text."""
+    if warning:
+        Console(stderr=True).print(f"[bold red]{escape(warning)}[/] (groundstation keys)", highlight=False)
+
+
+def print_notes(console: Console, flight: Flight) -> None:
+    """What a reader had to do to a flight."""
+    for note in flight.notes:
+        console.print(f"note: {escape(note)}", style="yellow")
+
+
+@contextmanager
+def working(console: Console, what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A line that says what is being done, unless `quiet`; yields what changes its words."""
+    if quiet:
+        yield lambda text: None
+        return
+    with console.status(what) as status:
+        yield lambda text: status.update(text)
+
+
+def counted(quiet: bool) -> Progress:
+    """A bar on standard error for work in countable pieces; gone when it is done, and never there if `quiet`."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        disable=quiet,
+        transient=True,
+    )

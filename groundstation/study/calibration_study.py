@@ -135,6 +135,25 @@ class Study:
                 )
 
 
+def study_of(
+    folder: Path, vehicle: Path, design: Path | None, seed: int, seconds: float, strength: float
+) -> Study:
+    """A study of all that can be hidden; the design is that beside the vehicle file unless given. Raises `InputError`
+    for files that are not there, and for flights too short to be held out in blocks."""
+    if not 40.0 <= seconds <= 1800.0:
+        raise InputError(
+            f"--seconds {seconds:g}: must be 40 to 1800, shorter flights cannot be held out in blocks"
+        )
+    if not vehicle.is_file():
+        raise InputError(f"{vehicle}: no such vehicle file")
+    believed = design or vehicle.with_name("design.json")
+    if not believed.is_file():
+        raise InputError(
+            f"{believed}: no design to fly by; make one: groundstation design {vehicle}, or pass --design"
+        )
+    return Study(folder, vehicle, believed, seed, seconds, hideable(), strength)
+
+
 def hideable() -> tuple[str, ...]:
     """Names that the simulator can hide and the catalogue knows; asks `sim-bridge effects`."""
     told = run_json(["sim-bridge", "effects", "--json"])["effects"]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from trueflight.groundstation.learn.training_data import samples_of_flights
 from trueflight.groundstation.operate.processes import run_json, running_rig
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.versions.store import add_effect
+from trueflight.groundstation.views import write_tracking
 from trueflight.models.contract import CORRECTED, LQR, LQR_INTEGRAL
 from trueflight.models.errors import InputError
 from trueflight.models.export import export_onnx
@@ -172,6 +173,52 @@ class Study:
             if (f.scenario, f.controller, f.through) == (scenario, controller, through)
         ]
         return np.array(rows, dtype=float).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a study in `folder` is of: the vehicle file, what is hidden in it (names as `sim-bridge` takes them), and
+    the minutes of flight to train on."""
+
+    folder: Path
+    vehicle: Path
+    hidden: tuple[str, ...]
+    minutes: float
+
+    @property
+    def truth(self) -> list[str]:
+        """The words for `sim-bridge` that hide it."""
+        return [word for name in self.hidden for word in ("--hidden", name)]
+
+    def open(self) -> None:
+        """Begin the folder or go on with it; raises `InputError` where it holds another study or foreign files."""
+        if not self.vehicle.is_file():
+            raise InputError(f"{self.vehicle}: no such vehicle file; give --vehicle")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        vehicle = self.vehicle.read_text(encoding="utf-8")
+        same_study(self.folder, {"hidden": list(self.hidden), "minutes": self.minutes, "vehicle": vehicle})
+
+
+def one_vehicle(
+    asked: Asked,
+    seed: int,
+    scenarios: Sequence[Scenario],
+    real: Sequence[Scenario],
+    jobs: int,
+    tell: Callable[[str, int], None],
+) -> tuple[Prepared, list[Flown]]:
+    """Prepare the vehicle of `seed` and fly it: `scenarios` in-process, `jobs` at a time, and those that are `real`
+    through the companion, too. `tell` is called with what is done now, and how many pieces are done with it."""
+    folder = asked.folder / f"vehicle-{seed}"
+    one = prepare(folder, asked.vehicle, seed, asked.truth, asked.minutes, lambda what: tell(what, 1))
+    tell("fly", 0)
+    flown = fly_all(folder, asked.vehicle, one, asked.truth, scenarios, jobs, lambda: tell("fly", 1))
+    if real:
+        tell("fly with the companion", 0)
+    flown += fly_companion(
+        folder, asked.vehicle, one, asked.truth, real, lambda: tell("fly with the companion", 1)
+    )
+    return one, flown
 
 
 def prepare(
@@ -372,3 +419,37 @@ def _fly_companion(
     return Flown(
         prepared.seed, scenario.name, arm.name, track_file(record).mse, "finished", guard, "companion"
     )
+
+
+def chosen_scenarios(names: Sequence[str] | None) -> list[Scenario]:
+    """The scenarios of these names, all where none is named; raises `InputError` for a name that is none."""
+    if not names:
+        return list(SCENARIOS)
+    by_name = {s.name: s for s in SCENARIOS}
+    for name in names:
+        if name not in by_name:
+            raise InputError(f"--scenario {name}: unknown; choose from {', '.join(by_name)}")
+    return [by_name[name] for name in dict.fromkeys(names)]
+
+
+def same_study(output: Path, asked: dict[str, Any]) -> None:
+    """Keep what was asked in the folder; raises `InputError` where it holds another study or foreign files."""
+    path = output / "study.json"
+    text = json.dumps(asked, indent=1)
+    if path.exists() and path.stat().st_size:  # empty where an earlier version was killed
+        if read_text(path, "the study", "choose another --output") != text:
+            raise InputError(f"{output}: holds another study (see {path.name}); choose another --output")
+    elif any(p != path and not p.name.startswith(".") for p in output.iterdir()):
+        raise InputError(f"{output}: holds files that are no study's; choose another --output")
+    else:
+        write_whole(path, text, "the study", "choose another --output")
+
+
+def write_unseen(path: Path, folder: Path, scenario: Scenario) -> None:
+    """A recording of the three controllers of the paper on one scenario, from the records in `folder`."""
+    names = {"lqr": "lqr", "lqr-+-integral": "lqr_integral", "effects-+-network": "corrected"}
+    tracked = [
+        replace(track_file(folder / f"{scenario.name}-{stem}.mcap"), label=label)
+        for stem, label in names.items()
+    ]
+    write_tracking(path, tracked)

@@ -12,6 +12,7 @@ from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model, linear_model, rigid_body_model
 from trueflight.models.record import read_record
+from trueflight.models.vehicle import Vehicle
 
 DECIDES = ("mass", "hover_thrust", "thrust_model")
 """What of a vehicle a model depends on: with another value its parameters mean something else."""
@@ -88,6 +89,19 @@ def choose_design(flight: Flight, given: str | Path | None = None) -> Design | N
     if record.suffix.lower() != ".mcap" or is_ros_bag(record):
         return None
     return read_record(record).design
+
+
+def design_to_fly(vehicle: Vehicle, flight: Flight | None = None, given: str | Path | None = None) -> Design:
+    """The design that a vehicle will fly by: the file `given`, else that of the record `flight`, else design.json
+    beside the vehicle file. Raises `InputError` where there is none."""
+    if given is not None:
+        return load_design(given, vehicle)
+    if flight is not None and (recorded := choose_design(flight)) is not None:
+        return recorded
+    beside = Path(vehicle.source).with_name("design.json") if vehicle.source else Path("design.json")
+    if not beside.is_file():
+        raise InputError(f"{beside}: no design to predict the flight by; pass --design FILE")
+    return load_design(beside, vehicle)
 
 
 def check_vehicle(model: Model, flight: Flight) -> None:

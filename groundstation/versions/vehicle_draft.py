@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from trueflight.groundstation.reading.flight_file import ULOGS
 from trueflight.groundstation.reading.px4_airborne import (
     RATE,
     Airborne,
@@ -23,10 +24,10 @@ from trueflight.groundstation.reading.px4_airborne import (
     period_mean,
 )
 from trueflight.groundstation.reading.px4_flight import ACCELEROMETER, FAST
-from trueflight.groundstation.reading.px4_log import Log
+from trueflight.groundstation.reading.px4_log import Log, load_ulog
 from trueflight.groundstation.reading.px4_thrust import commanded_thrust
 from trueflight.models.errors import InputError
-from trueflight.models.outside import toml_table
+from trueflight.models.outside import toml_table, unreadable
 from trueflight.models.vehicle import GRAVITY, Vehicle, vehicle_from_table
 from trueflight.models.whole_file import write_whole
 
@@ -89,6 +90,19 @@ def draft_vehicle(log: Log, mass: float | None = None) -> Draft:
     )
     text = _text(log, lines)
     return Draft(lines, text, vehicle_from_table(toml_table(text, "draft"), "draft"))
+
+
+def draft_of(file: Path, target: Path, mass: float | None = None) -> Draft:
+    """The vehicle drafted from the PX4 log `file`, not yet written at `target`. Raises `InputError` for another kind of
+    file, and where `target` is there already."""
+
+    if file.suffix.lower() not in ULOGS:
+        raise InputError(f"{file}: only a PX4 ULog holds the parameters that a vehicle file is drafted from")
+    if target.exists():
+        raise InputError(f"{target}: there is a file already; a draft never replaces one, name another")
+    log = load_ulog(file)
+    with unreadable(file, "the log", "copy it from the vehicle's card again"):
+        return draft_vehicle(log, mass)
 
 
 def write_draft(draft: Draft, path: Path) -> None:

@@ -26,12 +26,12 @@ from ulog_writer import TYPES, Written
 
 from trueflight.companion.settings import load_settings as companion_settings
 from trueflight.companion.store import live_file
-from trueflight.groundstation.commands.survey import _already
 from trueflight.groundstation.operate.settings import load_settings as ground_settings
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.mapping import load_mapping
 from trueflight.groundstation.reading.px4_log import load_ulog
 from trueflight.groundstation.study.calibration_study import Study
+from trueflight.groundstation.study.kept_survey import kept_rows
 from trueflight.groundstation.study.reproduce import _told
 from trueflight.groundstation.versions.store import find, newest, save, versions
 from trueflight.groundstation.versions.vehicle_draft import draft_vehicle
@@ -92,7 +92,7 @@ def readers(folder: Path) -> tuple[Reader, ...]:
     def survey(path: Path) -> None:
         (folder / "survey").mkdir(exist_ok=True)
         (folder / "survey" / "survey.jsonl").write_bytes(path.read_bytes())
-        _already(folder / "survey", [path])
+        kept_rows(folder / "survey", [path])
 
     def collection(path: Path) -> None:
         (folder / "collection").mkdir(exist_ok=True)

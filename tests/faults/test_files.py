@@ -184,16 +184,15 @@ def _alive(pid: int) -> bool:
 @pytest.mark.parametrize("left", ["", '{"seed": 1, "scen', "[1]"])
 def test_a_reproduction_goes_on_after_a_kill(left: str, tmp_path: Path) -> None:
     """An older version left half a file; this one a hidden one, or a record that nothing was told of yet."""
-    from trueflight.groundstation.commands.reproduce import _same_study
-    from trueflight.groundstation.study.reproduce import Flown, _kept
+    from trueflight.groundstation.study.reproduce import Flown, _kept, same_study
 
     flown = Flown(1, "unseen", "lqr", (1.0, 2.0, 3.0), "finished", "")
     (tmp_path / "study.json").write_text("")
     (tmp_path / ".study.json.12345678.part").mkdir()
-    _same_study(tmp_path, {"minutes": 5.0})
-    _same_study(tmp_path, {"minutes": 5.0})
+    same_study(tmp_path, {"minutes": 5.0})
+    same_study(tmp_path, {"minutes": 5.0})
     with pytest.raises(InputError, match="another study"):
-        _same_study(tmp_path, {"minutes": 6.0})
+        same_study(tmp_path, {"minutes": 6.0})
     path = tmp_path / "unseen-lqr"
     path.with_name("unseen-lqr.json").write_text(left)
     path.with_name("unseen-lqr.mcap").write_bytes(b"half a record")

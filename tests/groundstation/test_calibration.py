@@ -300,6 +300,7 @@ def test_a_study_is_flown_diagnosed_continued_and_not_mixed_with_another(
     assert table["flights"] == 1
     assert table["failed"] == table["not_flown"] == 0
     assert table == {
+        "schema": 1,
         **json.loads((folder / "calibration.json").read_text()),
         "report": str(folder / "report.html"),
     }

@@ -18,9 +18,9 @@ import pytest
 from trueflight.companion.telemetry import PIECE, Telemetry, make_event, read_json
 from trueflight.companion.zenoh_session import ZenohSettings, open_session
 from trueflight.groundstation.commands.app import app
-from trueflight.groundstation.commands.pilot import warn
 from trueflight.groundstation.operate.link import Link, companions
 from trueflight.groundstation.operate.settings import Settings, load_settings
+from trueflight.groundstation.output.terminal import print_warning
 from trueflight.models.errors import InputError, run_command_line
 from trueflight.models.record_pb2 import Tick
 
@@ -289,7 +289,7 @@ def test_what_is_open_to_anybody_is_told_in_red(endpoint, tmp_path, capsys):
             assert "insecure" in link.warning and "tcp/0.0.0.0:7447" in link.warning
             page = state("quad5", Tick(phase="idle"), 0.0, {"insecure": link.warning})
             assert "**INSECURE**" in page and "tcp/0.0.0.0:7447" in page
-            warn(link)
+            print_warning(link.warning)
             assert "anybody on the network can fly it" in capsys.readouterr().err
     finally:
         telemetry.close()

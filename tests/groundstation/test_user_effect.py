@@ -11,10 +11,10 @@ import onnxruntime
 import pytest
 from simulated import simulated
 
-from trueflight.groundstation.commands.effect import write_template
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.writing import write_flight
+from trueflight.groundstation.versions.effect_file import write_template
 from trueflight.models.errors import InputError
 from trueflight.models.export import export_onnx
 from trueflight.models.features import feature_matrix, feature_names, features_of_flight

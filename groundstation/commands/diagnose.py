@@ -1,0 +1,92 @@
+"""`groundstation diagnose`: which effect is missing."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from trueflight.groundstation.commands.options import (
+    DEFAULT_STORE,
+    BandwidthOption,
+    EffectsOption,
+    FlightArgument,
+    JsonOption,
+    MappingOption,
+    ModelOption,
+    SaveOption,
+    StoreOption,
+    ValidateOption,
+    VehicleOption,
+)
+from trueflight.groundstation.output.terminal import print_written, working
+from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json
+
+console = Console()
+
+
+def register(app: typer.Typer) -> None:
+    """Add this command to the ground station's application."""
+    app.command("diagnose")(diagnose_command)
+
+
+def diagnose_command(
+    flight: FlightArgument,
+    vehicle: VehicleOption = None,
+    validate: ValidateOption = None,
+    mapping: MappingOption = None,
+    model: ModelOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    effects: EffectsOption = None,
+    bandwidth: BandwidthOption = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Parameters of every effect, found or not.")
+    ] = False,
+    save: SaveOption = None,
+    thrust: Annotated[
+        str,
+        typer.Option(
+            "--thrust", help="command, or rotors: thrust by rotor speeds, what is beyond them is judged."
+        ),
+    ] = "command",
+    as_json: JsonOption = False,
+) -> None:
+    """Which effect is missing: ranked, with parameters and intervals, checked on held-out data.
+
+    Example: groundstation diagnose identify.csv --vehicle vehicle.toml --validate validate.csv --save analysis.rrd
+    """
+    from trueflight.groundstation.evaluate.analysis import analyse
+    from trueflight.groundstation.identify.rotors import thrust_from_rotors
+    from trueflight.groundstation.identify.translation import diagnose
+    from trueflight.groundstation.output.as_json import analysis_table
+    from trueflight.groundstation.output.tables import print_diagnosis
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.several import read_held_out
+    from trueflight.groundstation.versions.choice import choose_design, choose_line
+
+    if thrust not in ("command", "rotors"):
+        raise InputError(f"--thrust {thrust}: choose command or rotors")
+    read = read_flight(flight, vehicle, mapping)
+    held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
+    if thrust == "rotors":
+        read = thrust_from_rotors(read)
+        held_out = None if held_out is None else thrust_from_rotors(held_out)
+    line = choose_line(read, model, store, effects)
+    with working(console, "looking for missing effects", as_json) as progress:
+        if save is None and not as_json:
+            print_diagnosis(
+                console, diagnose(read, line[-1], held_out, bandwidth, progress=progress), everything
+            )
+            return
+        whole = analyse(read, line, held_out, bandwidth, choose_design(read), progress=progress)
+    if save is not None:
+        from trueflight.groundstation.views import write_analysis
+
+        write_analysis(save, whole)
+    if as_json:
+        print_json({**analysis_table(whole), "recording": None if save is None else str(save)})
+        return
+    print_diagnosis(console, whole.diagnosis, everything)
+    print_written(console, save)

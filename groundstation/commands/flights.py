@@ -1,0 +1,183 @@
+"""`groundstation flights` and `import`: flights listed, and brought into the project's own format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from trueflight.groundstation.commands.options import (
+    FlightArgument,
+    JsonOption,
+    MappingOption,
+    VehicleOption,
+)
+from trueflight.groundstation.output.terminal import print_notes, working
+from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json
+
+if TYPE_CHECKING:
+    from trueflight.groundstation.versions.vehicle_draft import Draft
+
+console = Console()
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the ground station's application."""
+    app.command("flights", epilog="Example: groundstation flights samples")(flights_command)
+    app.command(
+        "import",
+        epilog="Example: groundstation import log.csv --mapping mine.mapping.toml --vehicle vehicle.toml "
+        "-o flight.csv; groundstation import log.ulg --draft-vehicle vehicle.toml",
+    )(import_command)
+
+
+def flights_command(
+    directory: Annotated[Path, typer.Argument(help="Folder to look through.")] = Path("flights"),
+    as_json: JsonOption = False,
+) -> None:
+    """The flights in a folder: what was flown, how long, and what was measured."""
+    from rich.progress import track as progress
+
+    from trueflight.groundstation.reading.flight_file import ENDINGS
+    from trueflight.groundstation.reading.listing import flight_row
+    from trueflight.groundstation.reading.several import flight_files
+
+    files = flight_files(directory)
+    shown = (
+        files if as_json or len(files) < 4 else progress(files, "reading", console=console, transient=True)
+    )
+    rows = [flight_row(file, directory) for file in shown]
+    if as_json:
+        print_json(rows)
+        return
+    _print_flights(rows, directory)
+    if not files:
+        console.print(f"no flights in {directory} (known endings: {', '.join(ENDINGS)})")
+
+
+def _print_flights(rows: list[dict[str, Any]], directory: Path) -> None:
+    from rich.table import Table
+
+    table = Table(caption=f"{len(rows)} files in {directory}", caption_justify="left")
+    table.add_column("flight", overflow="fold")
+    table.add_column("date", no_wrap=True)
+    for heading in ("length", "in air", "rate"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    flown = any(row["trajectory"] for row in rows)
+    if flown:
+        table.add_column("flown")
+    table.add_column("measured", overflow="fold")
+    for row in rows:
+        cells = [escape(str(row["flight"])), row["date"]]
+        if row["error"]:
+            reason = str(row["error"]).removeprefix(str(directory / str(row["flight"]))).lstrip(":, ")
+            cells += ["", "", "", *[""] * flown, f"[red]{escape(reason)}[/red]"]
+        else:
+            cells += [f"{row['duration']:.1f} s", f"{row['flying']:.1f} s", f"{row['rate']:.0f} Hz"]
+            words = (row["trajectory"], row["controller"], row["model"])
+            cells += [escape(" ".join(word for word in words if word))] * flown
+            cells.append(" ".join(SHORT[word] for word in row["measured"]))
+        table.add_row(*cells)
+    console.print(table)
+
+
+SHORT = {
+    "accelerometer": "acc",
+    "position": "pos",
+    "attitude": "att",
+    "gyroscope": "gyro",
+    "battery": "batt",
+    "rotor speeds": "rpm",
+    "motor commands": "motors",
+    "reference": "ref",
+}
+
+
+def import_command(
+    file: FlightArgument,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Where to: .csv or .parquet.")] = None,
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
+    draft: Annotated[
+        Path | None,
+        typer.Option("--draft-vehicle", help="Draft a vehicle file from a PX4 log; never replaces one."),
+    ] = None,
+    mass: Annotated[float | None, typer.Option(help="kg, for the draft: PX4 does not know it.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Read any flight, check it, and write it in the project's own format with its vehicle file beside it.
+
+    From a PX4 ULog a vehicle file can be drafted first: `--draft-vehicle vehicle.toml`, with or without `-o`.
+    """
+    from trueflight.groundstation.output.as_json import draft_table, imported_table
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.writing import write_flight
+    from trueflight.groundstation.versions.vehicle_draft import draft_of, write_draft
+
+    _check_import(file, output, vehicle, draft, mass)
+    told: dict[str, Any] = {}
+    flight = None
+    with working(console, f"reading {escape(file.name)}", as_json):
+        drafted = None if draft is None else draft_of(file, draft, mass)
+        if output is not None:
+            flight = read_flight(file, vehicle if drafted is None else drafted.vehicle, mapping)
+            vehicle_path = write_flight(flight, output)
+            told = imported_table(flight, output, vehicle_path)
+    if drafted is not None and draft is not None:
+        write_draft(drafted, draft)
+        told |= draft_table(drafted, draft)
+    if as_json:
+        print_json(told)
+        return
+    if drafted is not None and draft is not None:
+        _print_draft(drafted, draft, file)
+    if flight is not None:
+        console.print(
+            f"{escape(str(output))}: {len(flight)} samples, {flight.duration:.1f} s at {1 / flight.dt:.0f} Hz"
+        )
+        console.print(f"{escape(str(vehicle_path))}: the vehicle as it was believed to be")
+        print_notes(console, flight)
+
+
+def _check_import(
+    file: Path, output: Path | None, vehicle: Path | None, draft: Path | None, mass: float | None
+) -> None:
+    """Raise `InputError` for options that contradict each other."""
+    if output is None and draft is None:
+        raise InputError("import: say where to write the flight with -o FILE.csv, or draft its vehicle file")
+    if output is not None and output.resolve() == file.resolve():
+        raise InputError(f"{output}: that is the file itself; choose another -o, the original stays as it is")
+    if mass is not None and draft is None:
+        raise InputError("--mass goes with --draft-vehicle; a vehicle file of your own tells its mass itself")
+    if draft is not None and vehicle is not None:
+        raise InputError("--draft-vehicle: leave out --vehicle, the draft is what the log tells without it")
+    if (
+        output is not None
+        and draft is not None
+        and output.with_suffix(".vehicle.toml").resolve() == draft.resolve()
+    ):
+        raise InputError(f"{draft}: -o writes the vehicle as it was read there; name the draft otherwise")
+
+
+def _print_draft(drafted: Draft, target: Path, file: Path) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"{escape(str(target))}: drafted from {escape(file.name)}", title_justify="left")
+    table.add_column("value", overflow="fold")
+    table.add_column("where it is from", overflow="fold")
+    for line in drafted.lines:
+        if line.key == "rotor_directions" and not line.stated:
+            continue
+        mark = "" if line.complete else "[yellow]TO COMPLETE[/yellow] "
+        value = f"{line.key} = {line.value}" if line.stated else f"{line.key} (left out)"
+        table.add_row(escape(value), mark + escape(line.source))
+    console.print(table)
+    console.print(
+        f"[yellow]the log cannot tell {escape(', '.join(drafted.to_complete))}[/yellow]: correct them in "
+        f"{escape(str(target))}",
+        highlight=False,
+    )

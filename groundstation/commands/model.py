@@ -1,0 +1,260 @@
+"""`groundstation model`: versions made, listed, shown and exported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from trueflight.groundstation.commands.options import (
+    DEFAULT_STORE,
+    BandwidthOption,
+    EffectsOption,
+    JsonOption,
+    MappingOption,
+    ModelOption,
+    SaveOption,
+    StoreOption,
+    VehicleOption,
+)
+from trueflight.groundstation.output.terminal import print_written, working
+from trueflight.models.errors import InputError
+from trueflight.models.printed import print_json
+from trueflight.models.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from trueflight.models.model import Model
+
+console = Console()
+model_app = typer.Typer(no_args_is_help=True, help="Make, list, show and export model versions.")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of model versions to the ground station's application."""
+    app.add_typer(model_app, name="model")
+
+
+@model_app.command("add")
+def model_add(
+    effect: Annotated[str, typer.Argument(help="Name of the effect: groundstation effects")],
+    flight: Annotated[Path, typer.Option("--flight", help="The flight to fit to.")],
+    validate: Annotated[
+        Path | None, typer.Option("--validate", help="Another flight, to see the error fall on.")
+    ] = None,
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
+    model: ModelOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    effects: EffectsOption = None,
+    bandwidth: BandwidthOption = None,
+    save: SaveOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Add an effect: refit, write a new model version, and show the error falling.
+
+    Example: groundstation model add rotor_drag --flight identify.csv --validate validate.csv
+    """
+    from trueflight.groundstation.evaluate.compare import compare, waterfall
+    from trueflight.groundstation.output import as_json as tables_json
+    from trueflight.groundstation.output.tables import print_waterfall
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.several import read_held_out
+    from trueflight.groundstation.versions.choice import choose_model
+    from trueflight.groundstation.versions.store import add_effect, lineage
+    from trueflight.groundstation.versions.store import save as save_version
+
+    read = read_flight(flight, vehicle, mapping)
+    held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
+    base = choose_model(read, model, store, effects)
+    with working(console, f"fitting {effect}", as_json):
+        made = add_effect(base, effect, [read], bandwidth)
+    made, path = save_version(store, made, base if base.version else None)
+    line = lineage(store, made)
+    steps = waterfall(read, held_out, line, bandwidth)
+    if save is not None:
+        from trueflight.groundstation.views import write_before_after
+
+        shown = read if held_out is None else held_out
+        before, after = (compare(shown, m, bandwidth, horizons=False) for m in (line[0], made))
+        write_before_after(save, before, after, steps)
+    if as_json:
+        print_json(
+            {
+                **tables_json.model_table(made),
+                "path": str(path),
+                "network_dropped": base.network is not None,
+                "waterfall": tables_json.waterfall_table(steps),
+                "recording": None if save is None else str(save),
+            }
+        )
+        return
+    print_waterfall(console, steps, read.name, None if held_out is None else held_out.name)
+    _print_added(made, base, effect)
+    console.print(f"model version: {path}")
+    print_written(console, save)
+
+
+def _print_added(made: Model, base: Model, effect: str) -> None:
+    if base.network is not None:
+        console.print(
+            f"v{made.version} has no network: that of v{base.version} was trained on what is left without {effect}; "
+            f"train a new one with 'groundstation train FLIGHT... --model v{made.version}'",
+            style="yellow",
+        )
+    term = made.terms[-1]
+    for name, value in term.values.items():
+        low, high = term.intervals[name]
+        console.print(f"{effect} {name} = {value:.4g}  [{low:.4g}, {high:.4g}]")
+
+
+@model_app.command("list")
+def model_list(
+    vehicle: Annotated[str | None, typer.Argument(help="Name of the vehicle; default: all.")] = None,
+    store: StoreOption = DEFAULT_STORE,
+    as_json: JsonOption = False,
+) -> None:
+    """The versions in the store.
+
+    Example: groundstation model list quad5
+    """
+    from rich.table import Table
+
+    from trueflight.groundstation.output.as_json import model_table
+    from trueflight.groundstation.output.tables import fit_rms
+    from trueflight.groundstation.versions.store import versions
+    from trueflight.models.model import read_model
+
+    if not store.is_dir():
+        raise InputError(
+            f"{store}: no model store here; 'groundstation model add' makes one, --store DIR names another"
+        )
+    names = [vehicle] if vehicle else sorted(p.name for p in store.iterdir() if p.is_dir())
+    models, damaged = [], []
+    for path in (path for name in names for path in versions(store, name)):
+        try:
+            models.append(read_model(path))
+        except InputError as error:
+            damaged.append({"path": str(path), "error": str(error)})
+    if as_json:
+        print_json([*(model_table(m) for m in models), *damaged])
+        return
+    table = Table()
+    for column in ("vehicle", "version", "from", "effects", "fit RMS m/s²", "made"):
+        table.add_column(column)
+    for m in models:
+        parent = "linear" if m.parent is None else f"v{m.parent}"
+        table.add_row(
+            m.vehicle.name,
+            f"v{m.version}",
+            parent,
+            ", ".join((*m.names(), *(() if m.network is None else (m.network.label,)))),
+            f"{fit_rms(m):.3f}",
+            m.created,
+        )
+    console.print(table)
+    for one in damaged:
+        console.print(escape(one["error"]), style="red", highlight=False)
+
+
+@model_app.command("show")
+def model_show(
+    which: Annotated[str, typer.Argument(help="Version number, or the model's JSON file.")],
+    vehicle: Annotated[
+        str, typer.Option("--vehicle-name", help="Name of the vehicle, for a version number.")
+    ] = "",
+    store: StoreOption = DEFAULT_STORE,
+    as_json: JsonOption = False,
+) -> None:
+    """One version: its effects and parameters.
+
+    Example: groundstation model show v2 --vehicle-name quad5
+    """
+    from trueflight.groundstation.output.as_json import model_table
+    from trueflight.groundstation.output.tables import print_model
+    from trueflight.groundstation.versions.store import find
+
+    model = find(store, vehicle or _only_vehicle(store), which)
+    if as_json:
+        print_json(model_table(model))
+        return
+    print_model(console, model)
+
+
+@model_app.command("export")
+def model_export(
+    which: Annotated[str, typer.Argument(help="Version number, or the model's JSON file.")],
+    flight: Annotated[
+        list[Path],
+        typer.Option(
+            "--flight", help="Flight that gives training range, golden vectors and actuation. Repeatable."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The ONNX file to write.")],
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a version as one ONNX file with its contract, ready to deploy.
+
+    What the flights show of the rate loop goes with it: the corrected controller looks ahead over it.
+
+    Example: groundstation model export v2 --flight identify.csv -o correction.onnx
+    """
+    from trueflight.groundstation.identify.actuation import actuation_of
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.versions.choice import check_vehicle
+    from trueflight.groundstation.versions.store import find
+    from trueflight.models.contract import model_hash
+    from trueflight.models.export import export_onnx, not_exported
+
+    flights = [read_flight(path, vehicle, mapping) for path in flight]
+    model = find(store, flights[0].vehicle.name, which)
+    for one in flights:
+        check_vehicle(model, one)
+    actuation = actuation_of(model, flights)
+    data = export_onnx(model, *flights, actuation=actuation)
+    write_whole(output, data, "the model", "choose another -o")
+    left = not_exported(model)
+    if as_json:
+        print_json(
+            {
+                "path": str(output),
+                "hash": model_hash(data),
+                "bytes": len(data),
+                "not_exported": list(left),
+                "actuation": actuation,
+            }
+        )
+        return
+    console.print(f"{output}: {model.label}, {len(data) / 1000:.0f} kB, hash {model_hash(data)}")
+    _print_exported(actuation, left)
+
+
+def _print_exported(actuation: Mapping[str, float], left: Sequence[str]) -> None:
+    rates = (
+        f"rates {1e3 * actuation['rate_delay']:.0f} ms delay and {1e3 * actuation['rate_lag']:.0f} ms lag"
+        if "rate_lag" in actuation
+        else "nothing of the rate loop (these flights do not show it)"
+    )
+    console.print(
+        f"looks ahead over: thrust {1e3 * actuation['thrust_delay']:.0f} ms delay and "
+        f"{1e3 * actuation['thrust_lag']:.0f} ms lag, {rates}",
+        highlight=False,
+    )
+    if left:
+        console.print(
+            f"not in it, for a static correction has no memory and no sensor: {', '.join(left)}",
+            style="yellow",
+        )
+
+
+def _only_vehicle(store: Path) -> str:
+    names = sorted(p.name for p in store.iterdir() if p.is_dir()) if store.is_dir() else []
+    if len(names) != 1:
+        raise InputError(f"{store}: holds {len(names)} vehicles; say which with --vehicle-name")
+    return names[0]

@@ -1,0 +1,166 @@
+"""`groundstation status` and `monitor`: what a companion is doing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from trueflight.groundstation.commands.options import (
+    CfgOption,
+    ConfigOption,
+    ConnectOption,
+    JsonOption,
+    KeysOption,
+    ListenOption,
+    ModeOption,
+    NameOption,
+    TimeoutOption,
+    ZenohOption,
+)
+from trueflight.groundstation.output.terminal import print_warning
+from trueflight.models.printed import print_json
+
+if TYPE_CHECKING:
+    pass
+
+console = Console()
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the ground station's application."""
+    app.command("status", epilog="Example: groundstation status -e tcp/192.168.1.7:7447 --json")(
+        status_command
+    )
+    app.command("monitor", epilog="Example: groundstation monitor --save flight.rrd")(monitor_command)
+
+
+def _position(position: dict[str, Any]) -> str:
+    """What the autopilot's estimator says of its position."""
+    if not position:
+        return "the autopilot has told nothing of it"
+    told = "none" if not position["valid"] else "valid"
+    return f"{told} (received: {position['received']})"
+
+
+def _mocap(pose: dict[str, Any]) -> str:
+    """Poses that the companion passes on; '' where it expects none."""
+    if not pose:
+        return ""
+    refused = ", ".join(f"{count} {kind}" for kind, count in pose["refused"].items())
+    told = f"{pose['rate']:.0f} Hz, refused: {refused or 'none'}"
+    if pose["latency_ms"]:
+        told += f", {pose['latency_ms']['median']:.1f} ms old when passed on"
+    return told if pose["good"] else f"no good pose; {told}"
+
+
+def status_command(
+    config: ConfigOption = None,
+    name: NameOption = None,
+    connect: ConnectOption = None,
+    mode: ModeOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ZenohOption = None,
+    cfg: CfgOption = None,
+    timeout: TimeoutOption = None,
+    keys: KeysOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """What the companion is doing, and whether it could fly now."""
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.settings import settings_with
+
+    settings = settings_with(
+        config, name=name, connect=connect, mode=mode, listen=listen, zenoh_config=zenoh_config, cfg=cfg,
+        timeout=timeout, keys=keys,
+    )  # fmt: skip
+    with Link(settings) as link:
+        status = link.status()
+        records = link.records()
+        print_warning(link.warning)
+    if as_json:
+        print_json({**status, "records": records})
+        return
+    _print_status(status, len(records))
+
+
+def _print_status(status: dict[str, Any], records: int) -> None:
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    ready = (
+        "[green]ready to fly[/green]"
+        if status["ready"]
+        else f"[yellow]{escape(status['not_ready'])}[/yellow]"
+    )
+    rates = ", ".join(f"{key} {value:.0f} Hz" for key, value in status.get("rates", {}).items())
+    titles = {
+        entry["hash"]: f"{entry['hash']} ({entry['name']} {entry['version']})" for entry in status["models"]
+    }
+    for model, signer in status.get("access", {}).get("signers", {}).items():
+        titles[model] = f"{titles.get(model, model)}, {f'signed by {signer}' if signer else 'not signed'}"
+    shadow, staged = status["shadow"], status["staged"]
+    waiting = ""
+    if shadow:
+        waiting = f"{shadow['title']}, {shadow['remaining']:.1f} s to go"
+    elif staged:
+        waiting = f"{staged['hash']} ({staged['name']} {staged['version']}), in the next corrected flight"
+    for what, value in (
+        ("vehicle", f"{escape(status['vehicle'])}: {ready}"),
+        (
+            "phase",
+            f"{status['phase']}, {status['flight_mode'] or 'no mode'}, "
+            f"{'armed' if status['armed'] else 'disarmed'}",
+        ),
+        ("battery", f"{status['battery_voltage']:.2f} V"),
+        ("position", escape(_position(status.get("position") or {}))),
+        ("received", rates or "not measured"),
+        ("mocap", escape(_mocap(status.get("pose") or {}))),
+        ("live model", escape(titles.get(status["live"], status["live"]))),
+        ("in the shadow", escape(waiting)),
+        ("last good", escape(titles.get(status["last_good"], status["last_good"]))),
+        ("guard", escape(status["guard"])),
+        ("records", f"{records} on board"),
+    ):
+        table.add_row(what, value or "none")
+    console.print(table)
+    for mission in status["missions"]:
+        reason = f" ({mission['reason']})" if mission["reason"] not in ("", mission["state"]) else ""
+        what = f"{mission['mission']} {mission['trajectory']} {mission['controller']}"
+        console.print(escape(f"{what}: {mission['state']}{reason}"), highlight=False)
+
+
+def monitor_command(
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write a Rerun recording instead of opening the viewer.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", help="Stop after this long; default: until Ctrl-C.", min=0.1)
+    ] = None,
+    config: ConfigOption = None,
+    name: NameOption = None,
+    connect: ConnectOption = None,
+    mode: ModeOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ZenohOption = None,
+    cfg: CfgOption = None,
+    timeout: TimeoutOption = None,
+    keys: KeysOption = None,
+) -> None:
+    """Watch a vehicle live in Rerun: path, reference, commands, correction, guard, latency."""
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.settings import settings_with
+    from trueflight.groundstation.views import monitor
+
+    settings = settings_with(
+        config, name=name, connect=connect, mode=mode, listen=listen, zenoh_config=zenoh_config, cfg=cfg,
+        timeout=timeout, keys=keys,
+    )  # fmt: skip
+    with Link(settings) as link:
+        print_warning(link.warning)
+        console.print(f"watching '{link.vehicle}'; Ctrl-C ends", highlight=False)
+        seen = monitor(link, save, seconds)
+    console.print(f"{seen} ticks seen" + (f", written to {escape(str(save))}" if save is not None else ""))

@@ -1,0 +1,100 @@
+"""What a survey of many flights looks like in a terminal of 100 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from trueflight.groundstation.evaluate.survey import Fleet, Row
+from trueflight.groundstation.output.tables import percent
+
+SHOWN = 40
+"""Flights in the table of a terminal; all are in what `--save` and `--json` give."""
+
+
+def print_survey(console: Console, rows: Sequence[Row], fleet: Fleet, folder: Path) -> None:
+    """Flights, effects and parameters."""
+    _print_flights(console, rows, folder)
+    usable = fleet.flights - fleet.failed
+    console.print(
+        f"[bold]{usable} of {fleet.flights} flights could be used[/bold], "
+        f"of {len(fleet.vehicles)} vehicle{'s' * (len(fleet.vehicles) != 1)}; "
+        f"{fleet.clean} lack nothing, {fleet.unexplained} hold something that no effect explains",
+        highlight=False,
+    )
+    _print_effects(console, fleet)
+    _print_parameters(console, fleet)
+
+
+def _print_flights(console: Console, rows: Sequence[Row], folder: Path) -> None:
+    root = folder.resolve()
+    table = Table(title=f"{folder}: {len(rows)} flights", title_justify="left")
+    table.add_column("flight", overflow="fold")
+    table.add_column("vehicle")
+    table.add_column("m/s²", justify="right", no_wrap=True)
+    table.add_column("missing")
+    table.add_column("possible")
+    for row in rows[:SHOWN]:
+        name = escape(str(Path(row.file).relative_to(root)))
+        if row.error:
+            table.add_row(name, "", "", "[red]could not be used[/red]", "")
+            continue
+        missing = ", ".join(row.named("missing")) + (
+            " [yellow]+ unexplained[/yellow]" if row.unexplained else ""
+        )
+        change = f"{row.rms_before:.2f} -> {row.rms_after:.2f}"
+        table.add_row(name, row.vehicle, change, missing, ", ".join(row.named("possible")))
+    console.print(table)
+    if len(rows) > SHOWN:
+        console.print(f"... and {len(rows) - SHOWN} more; --save or --json gives all", style="dim")
+    for row in rows:
+        if row.error:
+            console.print(f"[red]skipped[/red] {escape(row.error)}", highlight=False)
+
+
+def _print_effects(console: Console, fleet: Fleet) -> None:
+    table = Table(title="how often each effect is missing", title_justify="left")
+    for column in (
+        "effect",
+        "missing",
+        "possible",
+        "not there",
+        "not excited",
+        "share of those that show it",
+    ):
+        table.add_column(column, justify="left" if column == "effect" else "right")
+    for h in fleet.effects:
+        if not h.counts["missing"] and not h.counts["possible"]:
+            continue
+        counts = [str(h.counts[v]) for v in ("missing", "possible", "not_supported", "not_excited")]
+        share = (
+            ""
+            if h.share is None
+            else f"{percent(h.share)} ({percent(h.low or 0.0)} to {percent(h.high or 0.0)})"
+        )
+        table.add_row(h.effect, *counts, share)
+    if table.row_count:
+        console.print(table)
+
+
+def _print_parameters(console: Console, fleet: Fleet) -> None:
+    table = Table(title="parameters: mean, standard deviations, trend", title_justify="left")
+    for column in ("parameter", "flights", "mean", "vehicles", "flights", "of a fit", "trend a day"):
+        table.add_column(column, justify="left" if column == "parameter" else "right")
+    for s in fleet.parameters:
+        unit = "" if s.unit == "1" else f" {s.unit}"
+        spreads = ["" if x is None else f"{x:.2g}" for x in (s.between_vehicles, s.between_flights)]
+        trend = "" if s.trend_per_day is None else f"{s.trend_per_day:+.2g} (p {s.trend_p:.2g})"
+        mean = f"{s.mean:.3g}{unit}"
+        table.add_row(
+            f"{s.effect} {s.parameter}", str(s.flights), mean, *spreads, f"{s.uncertainty:.2g}", trend
+        )
+    if table.row_count:
+        console.print(table)
+        console.print(
+            "vehicles: from one to another; flights: of one vehicle, beyond the fit's own", style="dim"
+        )
