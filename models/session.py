@@ -16,11 +16,13 @@ from typing import Any
 
 import zenoh
 
-from trueflight.models.errors import InputError
+from trueflight.models.errors import InputError, shown
 
 ENCRYPTED = ("tls", "quic")
 _LOCAL = ("unixsock-stream", "unixpipe")
 LISTEN, CONNECT = "listen/endpoints", "connect/endpoints"
+PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "serial", "unixsock-stream", "unixpipe", "vsock")
+"""What an endpoint may begin with."""
 
 
 @dataclass(frozen=True)
@@ -166,16 +168,38 @@ def on_this_machine(end: str) -> bool:
 
 
 def short(error: Exception) -> str:
-    """Zenoh's words for an error without the places in its source code."""
+    """Zenoh's words for an error, without the names of its types and the places in its source code."""
     text = re.sub(r" at \S*/\S+\.rs:\d+\.?", "", " ".join(str(error).split()))
+    if said := re.search(r'(?:Message \{ msg: |^Str\()"((?:[^"\\]|\\.)*)"', text):
+        text = re.sub(r"\\(.)", r"\1", said[1])
     return text[:200].rstrip(". ")
 
 
 def _insert(config: zenoh.Config, one: Claim) -> None:
+    if one.path in (LISTEN, CONNECT):
+        _check_endpoints(one)
     try:
         config.insert_json5(one.path, one.value)
     except zenoh.ZError as error:
-        raise InputError(f"Zenoh does not take {one.path} = {_brief(one.value)} ({short(error)})") from None
+        told = f"{one.who}: " if one.who else ""
+        raise InputError(
+            f"{told}Zenoh does not take {one.path} = {_brief(one.value)} ({short(error)})"
+        ) from None
+
+
+def _check_endpoints(one: Claim) -> None:
+    """Raise `InputError` for an endpoint that is none, before Zenoh says so in words of its own."""
+    try:
+        said = json.loads(one.value)
+    except ValueError:
+        return  # JSON5, or nothing: Zenoh judges
+    for end in said if isinstance(said, list) else []:
+        known = isinstance(end, str) and re.match(r"([a-z0-9-]+)/.", end)
+        if isinstance(end, str) and not (known and known[1] in PROTOCOLS):
+            raise InputError(
+                f"{one.who or one.path}: {shown(end)} is no endpoint; write PROTOCOL/HOST:PORT, such as "
+                f"tcp/192.168.1.7:7447 (protocols: {', '.join(PROTOCOLS)})"
+            )
 
 
 def _normal(one: Claim) -> Any:

@@ -156,6 +156,24 @@ def test_two_flags_that_contradict_each_other_are_told() -> None:
         plan_session(both)
 
 
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (ZenohSettings(connect=("nonsense",)), r"-e .*'nonsense' is no endpoint; write PROTOCOL/HOST:PORT"),
+        (ZenohSettings(listen=("tpc/127.0.0.1:7447",)), r"-l .*'tpc/127\.0\.0\.1:7447' is no endpoint"),
+        (ZenohSettings(mode="sideways"), r"-m .*mode = \"sideways\" \(unknown variant"),
+        (ZenohSettings(cfg=("no/such:1",)), r"--cfg .*no/such = 1 \(unknown key\)"),
+    ],
+)
+def test_what_zenoh_would_not_take_is_told_without_the_names_of_its_types(
+    settings: ZenohSettings, told: str
+) -> None:
+    with pytest.raises(InputError, match=told) as caught:
+        plan_session(settings)
+    assert not {"Json5Err", "Message", "Str("} & set(str(caught.value).split())
+    assert "{" not in str(caught.value)
+
+
 AGAINST_KEYS = {
     "plain TCP": (ZenohSettings(listen=("tcp/127.0.0.1:7447",)), "not encrypted"),
     "the flag": (ZenohSettings(insecure=True), "--insecure contradicts"),
