@@ -47,7 +47,7 @@ def demo_command(
     Example: groundstation demo --seed 7
     """
     from trueflight.groundstation.operate.processes import program
-    from trueflight.groundstation.study.demonstration import REAL, demonstrate, real_flights
+    from trueflight.groundstation.study.demonstration import demonstrate
 
     audience = _Terminal()
     outcome = demonstrate(output, QUAD5, seed, hidden or [], audience)
@@ -56,16 +56,26 @@ def demo_command(
     screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"
     if viewer and screen:
         subprocess.Popen([program("rerun"), *map(str, outcome.recordings)], start_new_session=True)
-    if real and not all((SAMPLES / file).is_file() for file, _ in REAL):
+    if real:
+        show_real_flights()
+
+
+def show_real_flights() -> bool:
+    """What is found in the real flights of the repository; False, and one line, where an installation lacks them."""
+    from trueflight.groundstation.study.demonstration import REAL, real_flights
+
+    if not all((SAMPLES / file).is_file() for file, _ in REAL):
         console.print(
             "No real flights: samples/crazyflie is in the repository, not in this installation. For a flight of your "
             "own: groundstation diagnose FLIGHT",
             highlight=False,
             soft_wrap=True,
         )
-    elif real:
-        audience.step("Real flights of Crazyflies", "groundstation diagnose samples/crazyflie/...")
-        _print_real(real_flights(SAMPLES, audience))
+        return False
+    audience = _Terminal()
+    audience.step("Real flights of Crazyflies", "groundstation diagnose samples/crazyflie/...")
+    _print_real(real_flights(SAMPLES, audience))
+    return True
 
 
 class _Terminal:

@@ -86,7 +86,7 @@ def reproduce_command(
     if save is not None:
         r.write_unseen(save, output / f"vehicle-{first}", chosen[0])
     if as_json:
-        print_json({**_table(study, chosen), "recording": None if save is None else str(save)})
+        print_json({**study_table(study, chosen), "recording": None if save is None else str(save)})
         return
     _print(study, chosen, bool(real))
     print_written(console, save)
@@ -206,7 +206,8 @@ def _ratio(before: np.ndarray, after: np.ndarray) -> str:
     return f"{float(np.median(before) / np.median(after)):.0f}" if before.size and after.size else ""
 
 
-def _table(study: Study, scenarios: Sequence[Scenario]) -> dict[str, Any]:
+def study_table(study: Study, scenarios: Sequence[Scenario]) -> dict[str, Any]:
+    """The JSON of a study."""
     from trueflight.groundstation.study.reproduce import PAPER
 
     cells: dict[str, dict[str, dict[str, Any]]] = {}

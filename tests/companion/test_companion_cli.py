@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from json_schemas import valid
 from rig import VEHICLE, Bridge, free_port
 
 from trueflight.companion.settings import Settings, load_settings
@@ -58,6 +59,7 @@ def test_trajectories_are_listed_for_people_and_programs() -> None:
 
 def test_check_tells_what_arrives(bridge: tuple[Bridge, int]) -> None:
     report = json.loads(companion("check", "--connect", f"udpin://127.0.0.1:{bridge[1]}", "--json").stdout)
+    valid("companion check", report)
     assert 80.0 < report["rates"]["odometry"] <= 101.0
     assert report["accelerometer"]
     assert report["rotor_speeds"] == 4

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from json_schemas import valid
 from onnx_models import (
     bang_bang_model,
     constant_model,
@@ -291,7 +292,7 @@ def test_the_ground_deploys_waits_and_takes_back_from_the_command_line(
     companion.phase("mission")
     told = ground("deploy", good, "--shadow", 0.5, "--wait", "--json")
     assert told.returncode == 0, told.stderr
-    answer = json.loads(told.stdout)
+    answer = valid("groundstation deploy", json.loads(told.stdout))
     assert (answer["state"], answer["hash"]) == ("live", contract.model_hash(good.read_bytes()))
     told = ground("deploy", bad, "--wait")
     assert told.returncode == 2

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from json_schemas import valid
 from onnx_models import drag_model, make_live
 from rig import VEHICLE, Bridge, free_port
 from test_companion_cli import companion
@@ -151,7 +152,7 @@ def bridge() -> Iterator[int]:
 def test_the_whole_examination_with_an_autopilot(bridge: int, tmp_path: Path) -> None:
     flags = ["--vehicle", VEHICLE, "--connect", f"udpin://127.0.0.1:{bridge}", "--root", tmp_path]
     result = companion("doctor", *flags, "--json")
-    report = json.loads(result.stdout)
+    report = valid("companion doctor", json.loads(result.stdout))
     states = {row["name"]: row["state"] for row in report["findings"]}
     assert states["autopilot"] == states["odometry"] == states["accelerometer"] == OK
     assert result.returncode == (0 if report["ready"] else 2)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from json_schemas import valid
 from rig import VEHICLE, Bridge, free_port, wait_for
 from test_companion_cli import companion
 
@@ -35,7 +36,7 @@ def look(port: int, *flags: object) -> tuple[int, dict[str, Any]]:
     address = f"udpin://127.0.0.1:{port}"
     result = companion("preflight", "--connect", address, "--vehicle", VEHICLE, "--json", *flags)
     assert result.stdout, result.stderr
-    return result.returncode, json.loads(result.stdout)
+    return result.returncode, valid("companion preflight", json.loads(result.stdout))
 
 
 def rows(report: dict[str, Any], part: str) -> dict[str, dict[str, Any]]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from json_schemas import valid
 from simulated import VEHICLE
 
 from trueflight.groundstation.commands.app import app
@@ -296,7 +297,7 @@ def test_a_study_is_flown_diagnosed_continued_and_not_mixed_with_another(
     words = ("--flights", 1, "--seconds", 40, "--seed", 3, "-o", folder, "--jobs", 1)
     code, out, _ = run(capsys, monkeypatch, *words, "--json")
     assert code == 0
-    table = json.loads(out)
+    table = valid("groundstation calibrate", json.loads(out))
     assert table["flights"] == 1
     assert table["failed"] == table["not_flown"] == 0
     assert table == {

@@ -11,6 +11,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from json_schemas import valid
 
 from trueflight.companion.telemetry import Telemetry, read_json
 from trueflight.companion.zenoh_session import ZenohSettings, open_session
@@ -80,7 +81,7 @@ def collect(vehicle: Vehicle, folder: Path, capsys, *more: str) -> tuple[int, di
     except SystemExit as ended:
         code = int(ended.code or 0)
     out, err = capsys.readouterr()
-    return code, json.loads(out) if out else {}, err
+    return code, valid("groundstation collect", json.loads(out)) if out else {}, err
 
 
 def test_every_mission_of_the_database_is_flown_once_and_its_record_fetched(vehicle, tmp_path, capsys):

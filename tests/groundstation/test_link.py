@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import pytest
+from json_schemas import valid
 
 from trueflight.companion.telemetry import PIECE, Telemetry, make_event, read_json
 from trueflight.companion.zenoh_session import ZenohSettings, open_session
@@ -253,7 +254,7 @@ def test_a_flight_is_asked_for_watched_fetched_and_tracked(processes, endpoint, 
         assert told.returncode == 0, told.stderr
         return told.stdout
 
-    assert json.loads(ground("status", "-e", endpoint, "--json"))["ready"]
+    assert valid("groundstation status", json.loads(ground("status", "-e", endpoint, "--json")))["ready"]
     watch = subprocess.Popen(
         [program, "monitor", "-e", endpoint, "--save", recording, "--seconds", "6"],
         env=environment,
@@ -266,6 +267,7 @@ def test_a_flight_is_asked_for_watched_fetched_and_tracked(processes, endpoint, 
     )
     assert flown["state"] == "finished"
     assert watch.wait(60) == 0 and recording.stat().st_size > 10_000
+    valid("groundstation fly", flown)
     (tracked,) = json.loads(ground("track", flown["record"], "--json"))
     assert tracked["rms"] < 0.15
     (row,) = json.loads(ground("flights", tmp_path / "got", "--json"))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from json_schemas import valid
 from pyarrow import parquet
 from simulated import VEHICLE
 
@@ -64,7 +65,7 @@ def test_every_flight_is_a_row_and_a_bad_file_is_skipped(folder, tmp_path, capsy
         capsys, monkeypatch, "survey", folder, "--save", tmp_path, "--jobs", 2, "--memory", "1GB", "--json"
     )
     assert code == 0
-    result = json.loads(out)
+    result = valid("groundstation survey", json.loads(out))
     assert len(result["flights"]) == 22
     failed = [r for r in result["flights"] if r["error"]]
     assert {os.path.basename(r["file"]) for r in failed} == {"notes.csv", "cut.mcap"}

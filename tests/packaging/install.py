@@ -137,9 +137,8 @@ print(json.dumps({"ours": ours, "version": trueflight.__version__, "foreign": [m
 """
 
 REAL_FLIGHTS = """
-from rich.console import Console
-from trueflight.groundstation.commands.demo import real_flights
-assert real_flights(Console()) == []
+from trueflight.groundstation.commands.demo import show_real_flights
+assert not show_real_flights()
 """
 
 

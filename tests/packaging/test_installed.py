@@ -5,7 +5,8 @@ from importlib.metadata import version
 import pytest
 
 import trueflight
-from trueflight.groundstation.commands.demo import REAL, SAMPLES
+from trueflight.groundstation.commands.demo import SAMPLES
+from trueflight.groundstation.study.demonstration import REAL
 
 
 def test_the_version_is_the_installed_one() -> None:

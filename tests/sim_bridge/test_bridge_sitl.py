@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bridge_process import QUAD5, free_ports
+from json_schemas import valid
 from px4_peer import ARMED, Hover, ParameterServer, Px4Peer
 from pymavlink.dialects.v20 import common as mav
 
@@ -54,7 +55,7 @@ class Running:
         """The next event of a kind."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            self.events.append(json.loads(line))
+            self.events.append(valid("sim-bridge sitl", json.loads(line)))
             if self.events[-1]["event"] == kind:
                 return self.events[-1]
         raise AssertionError(f"no '{kind}': {self.process.communicate()[1]}")
@@ -62,7 +63,7 @@ class Running:
     def end(self) -> tuple[int, str, list[dict[str, Any]]]:
         """Exit code, standard error and all events, once it has ended by itself."""
         out, errors = self.process.communicate(timeout=30)
-        self.events += [json.loads(line) for line in out.splitlines()]
+        self.events += [valid("sim-bridge sitl", json.loads(line)) for line in out.splitlines()]
         return self.process.returncode, errors, self.events
 
 
