@@ -15,6 +15,7 @@ from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.writing import write_flight
 from trueflight.groundstation.versions.effect_file import write_template
+from trueflight.models.effects import catalogue
 from trueflight.models.errors import InputError
 from trueflight.models.export import export_onnx
 from trueflight.models.features import feature_matrix, feature_names, features_of_flight
@@ -77,6 +78,19 @@ def test_template_is_ranked_fitted_added_and_exported(flight_with_tether: Path, 
     higher[0, 0] = 3.0
     delta = [session.run(None, {"features": f})[0][0] for f in (hover, higher)]
     np.testing.assert_allclose(delta[1] - delta[0], [0, 0, -pull["value"]], atol=1e-3)
+
+
+def test_an_import_by_its_old_name_is_told_with_the_new_one(tmp_path, monkeypatch) -> None:
+    (tmp_path / "old.py").write_text("from models.effect import Effect\n")
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(ROOT))])
+    with pytest.raises(InputError, match=r"old\.py: no module 'models.*; import it from trueflight\.models"):
+        catalogue(str(tmp_path))
+
+
+def test_a_library_that_is_not_there_is_told_as_it_is(tmp_path) -> None:
+    (tmp_path / "alone.py").write_text("import models_of_nobody\n")
+    with pytest.raises(InputError, match="cannot be loaded: ModuleNotFoundError: No module named 'models_of_nobody'"):
+        catalogue(str(tmp_path))
 
 
 @pytest.fixture(scope="module")
