@@ -53,7 +53,9 @@ def _load(path: Path) -> object:
         folder = (error.name or "").split(".")[0]
         if folder not in ("models", "companion", "groundstation", "sim_bridge"):
             raise InputError(f"{path}: cannot be loaded: {type(error).__name__}: {error}") from None
-        raise InputError(f"{path}: no module '{error.name}'; import it from trueflight.{error.name}") from None
+        raise InputError(
+            f"{path}: no module '{error.name}'; import it from trueflight.{error.name}"
+        ) from None
     except Exception as error:  # noqa: BLE001 - a user's file may fail in any way; it is told in one line
         raise InputError(f"{path}: cannot be loaded: {type(error).__name__}: {error}") from None
     return getattr(module, "EFFECT", None)

@@ -89,7 +89,9 @@ def test_an_import_by_its_old_name_is_told_with_the_new_one(tmp_path, monkeypatc
 
 def test_a_library_that_is_not_there_is_told_as_it_is(tmp_path) -> None:
     (tmp_path / "alone.py").write_text("import models_of_nobody\n")
-    with pytest.raises(InputError, match="cannot be loaded: ModuleNotFoundError: No module named 'models_of_nobody'"):
+    with pytest.raises(
+        InputError, match="cannot be loaded: ModuleNotFoundError: No module named 'models_of_nobody'"
+    ):
         catalogue(str(tmp_path))
 
 
