@@ -18,8 +18,10 @@ INK, FILL, ARROW = "#1a2b3c", "#e8eef5", "#7a8ca0"
 
 FLOORS = (  # groundstation/, from the top: who may import stands above what is imported
     ("commands", "library"),
-    ("study", "views", "report"),
-    ("output", "versions", "learn"),
+    ("study",),
+    ("views", "report"),
+    ("output",),
+    ("versions", "learn"),
     ("evaluate",),
     ("identify",),
     ("reading", "measured", "design", "operate", "results"),
@@ -91,7 +93,7 @@ def save(figure: plt.Figure, name: str) -> None:
 
 def house() -> None:
     """groundstation/: rooms and arrows; an arrow points from who imports to what is imported."""
-    figure, axes = plt.subplots(figsize=(10, 7.2))
+    figure, axes = plt.subplots(figsize=(10, 9))
     place = {}
     for floor, names in enumerate(FLOORS):
         for i, name in enumerate(names):
@@ -109,7 +111,7 @@ def house() -> None:
         )  # fmt: skip
     for name, (x, y) in place.items():
         box(axes, x, y, 1.7, name)
-    axes.set(xlim=(-6, 6), ylim=(-7.8, 0.6))
+    axes.set(xlim=(-6, 6), ylim=(-10.7, 0.6))
     axes.axis("off")
     save(figure, "house.svg")
     print(f"{len(arrows)} arrows between {len(place)} rooms, {sum(arrows.values())} import statements")
