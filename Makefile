@@ -6,7 +6,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 SEED ?= 7
 
-.PHONY: setup demo test test-long lint coverage mutation wheel-test bench faults clean
+.PHONY: setup demo test test-long lint coverage mutation wheel-test bench faults clean docs
 
 setup: $(VENV)/.installed
 
@@ -59,6 +59,11 @@ SCALE ?= $(if $(QUICK),0.1,1)
 
 faults: setup
 	$(BIN)/python tests/faults/campaign.py --scale $(SCALE) $(FAULTS)
+
+# The documentation site into build/site; a link that leads nowhere is an error.
+docs: setup
+	$(BIN)/pip install --quiet -e '.[docs]'
+	$(BIN)/sphinx-build --fail-on-warning --keep-going -q -b html docs build/site
 
 clean:
 	rm -rf $(VENV) out build mutants *.egg-info
