@@ -262,10 +262,12 @@ class Diagnosis(results.Diagnosis):
         return data_frame({name: [row[k] for row in rows] for k, name in enumerate(names)}, index=names[:2])
 
     def to_dict(self) -> dict[str, Any]:
-        """What `groundstation diagnose --json` prints, in the units that it names."""
-        from trueflight.groundstation.output.as_json import diagnosis_table
+        """What `groundstation diagnose --json` prints, in the units that it names: the diagnosis and its `analysis`,
+        with the design that the flight's record carries, where it does."""
+        from trueflight.groundstation.output.as_json import analysis_table
+        from trueflight.groundstation.versions.choice import choose_design
 
-        return diagnosis_table(self)
+        return analysis_table(self.analysis(choose_design(self.flight)))
 
     def summary(self, everything: bool = False) -> Summary:
         """Verdicts and residuals as `groundstation diagnose` prints them; with `everything` the parameters of effects
@@ -311,14 +313,16 @@ class Diagnosis(results.Diagnosis):
         )
 
     def report(self, output: str | Path, design: Design | None = None) -> Path:
-        """Write the diagnosis to `output` as one HTML page that opens offline; with a `design` its tracking, too.
+        """Write the diagnosis to `output` as one HTML page that opens offline, with its tracking where there is a
+        `design` (None: that of the flight's record).
 
         Returns the path. Raises `InputError` where it cannot be written.
         """
         from trueflight.groundstation.output.as_json import analysis_table
         from trueflight.groundstation.report import render, write_report
+        from trueflight.groundstation.versions.choice import choose_design
 
-        whole = self.analysis(design)
+        whole = self.analysis(choose_design(self.flight) if design is None else design)
         write_report(Path(output), render(whole, analysis_table(whole)))
         return Path(output)
 
