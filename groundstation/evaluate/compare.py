@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from typing import Any
+
 import numpy as np
 
 from trueflight.groundstation.identify.fitting import with_clock
@@ -148,15 +151,8 @@ def _three(x: np.ndarray) -> tuple[float, float, float]:
 
 def _rows(motion: Motion, k: np.ndarray) -> Motion:
     """The motion at some of its samples."""
-    euler = motion.euler
-    return motion.with_(
-        command=motion.command[k],
-        thrust=motion.thrust[k],
-        force=motion.force[k],
-        reading=motion.reading[k],
-        rotation=motion.rotation[k],
-        euler=None if euler is None else (euler[0][k], euler[1][k]),
-        cos_yaw=motion.cos_yaw[k],
-        sin_yaw=motion.sin_yaw[k],
-        voltage=None if motion.voltage is None else motion.voltage[k],
-    )
+    columns = {f.name: getattr(motion, f.name) for f in fields(motion)}
+    changes: dict[str, Any] = {n: x[k] for n, x in columns.items() if isinstance(x, np.ndarray)}
+    if motion.euler is not None:
+        changes["euler"] = (motion.euler[0][k], motion.euler[1][k])
+    return motion.with_(**changes)

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 from scipy import signal
+from simulated import simulated
 
 from trueflight.groundstation.evaluate.compare import compare
 from trueflight.groundstation.evaluate.where import where_it_fails
 from trueflight.groundstation.identify.fitting import MeasuredFlights, critical_value, fit
 from trueflight.groundstation.measured.measurement import measure
+from trueflight.models.effect import Stage
+from trueflight.models.effects import catalogue
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.frames import quaternion_from_euler
@@ -125,6 +128,17 @@ def test_open_loop_error_falls_with_the_right_model() -> None:
     assert [h.horizon for h in horizons] == [0.1, 0.5, 1.0]
     assert horizons[0].restarts > 50
     assert np.linalg.norm(horizons[0].position) < np.linalg.norm(horizons[2].position)
+
+
+def test_every_effect_can_be_compared_open_loop_and_the_sensors_do_not_move_the_vehicle() -> None:
+    flown = simulated(5, "wind:4")
+    at = {e.name: Term(e.name, {p.name: p.typical for p in e.parameters}) for e in catalogue().values()}
+    base = rigid_body_model(flown.vehicle)
+    base = base.with_terms((*base.terms, at["transport_delay"]))  # so that no clock is fitted
+    sensors = [n for n, e in catalogue().items() if e.stage is Stage.SENSOR]
+    alone = compare(flown, base).horizons
+    assert compare(flown, base.with_terms((*base.terms, *(at[n] for n in sensors)))).horizons == alone
+    assert len(compare(flown, base.with_terms(tuple(at.values()))).horizons) == len(alone) == 3
 
 
 def test_too_short_a_flight_is_refused_in_one_line() -> None:
