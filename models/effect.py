@@ -15,11 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from trueflight.models.array import ABSENT, Array
 from trueflight.models.flight import Flight
 from trueflight.models.vehicle import GRAVITY, Vehicle
-
-Array = Any
-"""An array of any library that follows the Array API standard."""
 
 DESCENT, BELOW_CEILING = "descent", "below_ceiling"
 """Flights that alone show some effects: a fast descent into one's own wake; close below something that hangs."""
@@ -61,19 +59,19 @@ class Motion:
     thrust: Array
     force: Array
     reading: Array
-    thrust_acceleration: Array = None
-    rotation: Array = None
-    euler: Array = None
-    air_velocity: Array = None
-    cos_yaw: Array = None
-    sin_yaw: Array = None
-    height: Array = None
-    voltage: Array = None
-    body_rate: Array = None
-    body_acceleration: Array = None
-    rotor_thrust: Array = None
-    rotor_speed: Array = None
-    torque: Array = None
+    thrust_acceleration: Array = ABSENT
+    rotation: Array = ABSENT
+    euler: tuple[Array, Array] | None = None
+    air_velocity: Array = ABSENT
+    cos_yaw: Array = ABSENT
+    sin_yaw: Array = ABSENT
+    height: Array = ABSENT
+    voltage: Array = ABSENT
+    body_rate: Array = ABSENT
+    body_acceleration: Array = ABSENT
+    rotor_thrust: Array = ABSENT
+    rotor_speed: Array = ABSENT
+    torque: Array = ABSENT
     tau: float = 0.0
     delay: float = 0.0
     rate_lag: float = 0.0
@@ -85,7 +83,8 @@ class Motion:
         r, v = self.rotation, self.air_velocity
         x, y, z = v[:, 0], v[:, 1], v[:, 2]
         # written out: a batch of small products is slow in every array library
-        return tuple(r[:, 0, j] * x + r[:, 1, j] * y + r[:, 2, j] * z for j in range(3))
+        a, b, c = (r[:, 0, j] * x + r[:, 1, j] * y + r[:, 2, j] * z for j in range(3))
+        return a, b, c
 
     def with_(self, **changes: Any) -> Motion:
         """A copy with some fields changed."""

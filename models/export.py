@@ -8,6 +8,7 @@ import json
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import onnx
@@ -50,7 +51,7 @@ class Correction(torch.nn.Module):
         if not self.chain and learnt is not None:
             return learnt
         columns = {name: features[:, i] for i, name in enumerate(self.names)}
-        known = error_acceleration(motion_of_features(columns, self.vehicle), self.chain)
+        known: Any = error_acceleration(motion_of_features(columns, self.vehicle), self.chain)
         return known if learnt is None else known + learnt
 
 

@@ -44,7 +44,7 @@ class Network:
     features: tuple[str, ...]
     centre: np.ndarray
     scale: np.ndarray
-    layers: tuple[Layer, ...]
+    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
     output_scale: np.ndarray
     low: np.ndarray
     high: np.ndarray

@@ -53,7 +53,7 @@ class Database:
     @property
     def flown_seconds(self) -> float:
         """Flight time that the folder has already, s."""
-        return sum(entry["seconds"] for entry in self.collection.flown.values())
+        return float(sum(entry["seconds"] for entry in self.collection.flown.values()))
 
     def entries(self) -> list[dict[str, Any]]:
         """What is known of each flight, once all have flown."""

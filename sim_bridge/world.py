@@ -143,11 +143,11 @@ class World:
     def energy(self) -> float:
         """Kinetic plus potential energy in J (potential zero at the ground)."""
         mass = float(self.model.body_mass[1])
-        moments = self.model.body_inertia[1]
-        vx, vy, vz, p, q, r = self.velocity.tolist()
+        moments = [float(moment) for moment in self.model.body_inertia[1]]
+        vx, vy, vz, p, q, r = map(float, self.velocity)
         turning = moments[0] * p * p + moments[1] * q * q + moments[2] * r * r
         return (
             0.5 * mass * (vx * vx + vy * vy + vz * vz)
-            + 0.5 * float(turning)
-            + mass * GRAVITY * self.position[2]
+            + 0.5 * turning
+            + mass * GRAVITY * float(self.position[2])
         )

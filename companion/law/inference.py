@@ -74,7 +74,8 @@ class Model:
         given, answer, binding = self._bound[len(rows)]
         given[:] = rows
         self._session.run_with_iobinding(binding)
-        return answer.tolist()
+        found: list[list[float]] = answer.tolist()
+        return found
 
     def watched(self, limits: GuardLimits | None = None) -> Watch:
         """A watch over this model, for one flight."""

@@ -126,7 +126,7 @@ def _horizons(flight: Flight, motion: Motion, chain: Chain, used: np.ndarray) ->
 
     def world_acceleration(k: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         at = _rows(base, k).with_(height=position[:, 2], air_velocity=heading_from_world(velocity, yaw[k]))
-        return world_from_heading(acceleration(apply_effects(at, rest)), yaw[k])
+        return world_from_heading(np.asarray(acceleration(apply_effects(at, rest))), yaw[k])
 
     position, velocity = flown[starts].copy(), speed[starts].copy()
     now = world_acceleration(starts, position, velocity)

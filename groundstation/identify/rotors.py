@@ -32,7 +32,7 @@ class MeasuredRotors(MeasuredFlights):
         parts = []
         for m, motion in zip(self.measurements, self.motions, strict=True):
             level = motion.with_(rotor_thrust=None, torque=None)
-            parts.append(m.smooth(apply_effects(level, chain).thrust[:, None])[m.used])
+            parts.append(m.smooth(np.asarray(apply_effects(level, chain).thrust)[:, None])[m.used])
         return np.concatenate(parts)
 
     def measured(self) -> np.ndarray:

@@ -62,14 +62,14 @@ class Turning:
     @cached_property
     def control(self) -> np.ndarray:
         """Angular acceleration (K, 3) of the rotors' thrusts without any effect."""
-        return self.columns(apply_effects(self.motion, ()).torque)
+        return self.columns(np.asarray(apply_effects(self.motion, ()).torque))
 
     @cached_property
     def nuisances(self) -> list[tuple[str, np.ndarray]]:
         """Name and column (K, 3) of what is fitted beside every effect: first a gain of the control torque about each
         axis, which effects go through as well."""
         motion, r = self.motion, self.rotation
-        torque = apply_effects(motion, ()).torque / self.inertia
+        torque = np.asarray(apply_effects(motion, ()).torque) / self.inertia
         rate, shift = motion.body_rate, derivative(torque, self.rotation.flight.t)
         found = []
         for axis, name in enumerate("xyz"):
@@ -128,7 +128,7 @@ def _as_late_as_it_acts(motion: Motion, rotation: Rotation, inertia: np.ndarray)
     measured = rotation.value[rotation.used][:, :2]
 
     def misfit(x: np.ndarray) -> float:
-        torque = apply_effects(acting(*x), ()).torque / inertia
+        torque = np.asarray(apply_effects(acting(*x), ()).torque) / inertia
         seen = rotation.smooth(torque[:, :2])[rotation.used]
         seen = seen - seen.mean(axis=0)
         gain = np.sum(seen * measured, axis=0) / np.maximum(np.sum(seen**2, axis=0), 1e-12)
@@ -196,8 +196,8 @@ class TorqueProblem:
             effect, motion = self.effects[name], self.turning.motion
             neutral = effect.neutral(motion.vehicle)
             moved = {**neutral, parameter.name: parameter.typical}
-            with_it = self.turning.columns(apply_effects(motion, [(effect, moved)]).torque)
-            without = self.turning.columns(apply_effects(motion, [(effect, neutral)]).torque)
+            with_it = self.turning.columns(np.asarray(apply_effects(motion, [(effect, moved)]).torque))
+            without = self.turning.columns(np.asarray(apply_effects(motion, [(effect, neutral)]).torque))
             self._seen[key] = (with_it - without) / (parameter.typical - neutral[parameter.name])
         return self._seen[key]
 
