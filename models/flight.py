@@ -66,14 +66,35 @@ COLUMNS: dict[str, tuple[tuple[str, ...], str, str]] = {
 
 
 @dataclass(frozen=True)
+class Check:
+    """One pair of columns that physics ties together, compared.
+
+    `verdict` is "agrees", "undone" (`text` says what), "weak" (a warning), "contradicts" (a refusal), "cannot tell"
+    (the flight moves too little). `left` is the share of the motion's energy by which the two differ, NaN where nothing
+    moves. `text` is one sentence, `mapping` the lines of a mapping that mend it. `angle` in rad and `late` in s, NaN
+    where neither is meant.
+    """
+
+    pair: str
+    verdict: str
+    left: float
+    text: str = ""
+    mapping: str = ""
+    angle: float = float("nan")
+    late: float = float("nan")
+
+
+@dataclass(frozen=True)
 class Flight:
     """One flight, in columns.
 
     `t` (N,) in s, strictly increasing; every other column has N rows or is None. World ENU, body FLU, quaternion
     w, x, y, z body to world, SI units. `flying` (N,) bool marks the samples to analyse (in the air, under the
     recorded commands). `accelerometer` is False where `specific_force` was differentiated from the trajectory;
-    `bandwidth` is then its bandwidth in Hz, otherwise None. `origin` is the file, `data_hash` its SHA-256.
-    `notes` tells what the reader had to do (resampling, gaps, cut takeoff).
+    `bandwidth` is then its bandwidth in Hz, otherwise None. `sensor_rate` is the rate in Hz at which the accelerometer
+    (or velocity) has new values, where the log repeats them; otherwise None.
+    `origin` is the file, `data_hash` its SHA-256.
+    `notes` tells what the reader had to do (resampling, gaps, cut takeoff), `consistency` which of its columns agree.
     """
 
     name: str
@@ -96,10 +117,12 @@ class Flight:
     flying: np.ndarray | None = None
     accelerometer: bool = True
     bandwidth: float | None = None
+    sensor_rate: float | None = None
     origin: str = ""
     data_hash: str = ""
     notes: tuple[str, ...] = ()
     extra: dict[str, np.ndarray] = field(default_factory=dict)
+    consistency: tuple[Check, ...] = ()
 
     def __len__(self) -> int:
         return len(self.t)

@@ -21,6 +21,7 @@ from trueflight.models.printed import print_json
 
 if TYPE_CHECKING:
     from trueflight.groundstation.versions.vehicle_draft import Draft
+    from trueflight.models.flight import Flight
 
 console = Console()
 
@@ -107,6 +108,9 @@ def import_command(
         typer.Option("--draft-vehicle", help="Draft a vehicle file from a PX4 log; never replaces one."),
     ] = None,
     mass: Annotated[float | None, typer.Option(help="kg, for the draft: PX4 does not know it.")] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only tell which columns agree with each other; writes nothing.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Read any flight, check it, and write it in the project's own format with its vehicle file beside it.
@@ -118,6 +122,11 @@ def import_command(
     from trueflight.groundstation.reading.writing import write_flight
     from trueflight.groundstation.versions.vehicle_draft import draft_of, write_draft
 
+    if check:
+        if output is not None or draft is not None:
+            raise InputError("--check writes nothing; leave out -o and --draft-vehicle, or --check")
+        _tell_consistency(read_flight(file, vehicle, mapping), as_json)
+        return
     _check_import(file, output, vehicle, draft, mass)
     told: dict[str, Any] = {}
     flight = None
@@ -141,6 +150,17 @@ def import_command(
         )
         console.print(f"{escape(str(vehicle_path))}: the vehicle as it was believed to be")
         print_notes(console, flight)
+
+
+def _tell_consistency(flight: Flight, as_json: bool) -> None:
+    from trueflight.groundstation.output.as_json import consistency_table
+    from trueflight.groundstation.output.tables import print_consistency
+
+    if as_json:
+        print_json({"notes": list(flight.notes), "consistency": consistency_table(flight)})
+        return
+    print_consistency(console, flight)
+    print_notes(console, flight)
 
 
 def _check_import(

@@ -152,7 +152,7 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
             "specific_force_x, _y, _z "
             "or velocity_* and quaternion_* (map yours with --mapping)"
         )
-    bandwidth = min(bandwidth or default, 0.4 * fs)
+    bandwidth = min(bandwidth or default, 0.4 * min(fs, flight.sensor_rate or fs))
     sos = signal.butter(4, bandwidth, fs=fs, output="sos")
     step = max(1, int(fs / (2.5 * bandwidth))) if thin else 1
     rows = np.arange(0, len(flight), step)
@@ -188,6 +188,10 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
 
         value = see(raw)
     used, left_out = _used(flight, bandwidth)
+    # of values that a log repeats, only the new ones tell the noise
+    every = max(1, round(fs / flight.sensor_rate)) if flight.sensor_rate else 1
+    its_own = signal.butter(4, min(bandwidth, 0.45 * fs / every), fs=fs / every, output="sos")
+    noise = _noise(raw[::every], used[::every], its_own, fs / every, differentiate)
     return Measurement(
         flight=flight,
         t=flight.t[rows],
@@ -197,7 +201,7 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
         see=see,
         smooth=smooth,
         bandwidth=bandwidth,
-        noise=_noise(raw, used, sos, fs, differentiate),
+        noise=noise,
         axes=(0, 1, 2) if flight.quaternion is not None else (2,),
         left_out=left_out,
     )

@@ -12,6 +12,7 @@ import numpy as np
 from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
 from trueflight.models.effect import Effect
 from trueflight.models.effects import effect_named
+from trueflight.models.flight import Flight
 from trueflight.models.model import Model
 from trueflight.models.network import Network
 from trueflight.models.outside import toml_table
@@ -86,12 +87,29 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
         "nuisance": {"clock_shift": {"value": d.clock_shift, "unit": "s"}},
         "left_out": d.left_out,
         "notes": list(d.flight.notes),
+        "consistency": consistency_table(d.flight),
     }
     if d.rotational is not None:
         table["rotational_rms"] = {**asdict(d.rotational), "unit": "rad/s^2"}
     if d.validation_before is not None:
         table["validation_rms"] = {"before": d.validation_before, "after": d.validation_after, "unit": UNIT}
     return plain(table)
+
+
+def consistency_table(flight: Flight) -> list[dict[str, Any]]:
+    """The JSON of what the reader held against each other."""
+    return [
+        {
+            "pair": c.pair,
+            "verdict": c.verdict,
+            "left": plain(c.left),
+            "text": c.text,
+            "mapping": c.mapping,
+            "angle_deg": plain(float(np.degrees(c.angle))),
+            "late_s": plain(c.late),
+        }
+        for c in flight.consistency
+    ]
 
 
 def comparison_table(c: Comparison) -> dict[str, Any]:
@@ -112,6 +130,7 @@ def comparison_table(c: Comparison) -> dict[str, Any]:
             },
             "open_loop": [asdict(h) for h in c.horizons],
             "notes": list(c.flight.notes),
+            "consistency": consistency_table(c.flight),
         }
     )
 
@@ -439,6 +458,7 @@ def imported_table(flight: Flight, path: Path, vehicle: Path) -> dict[str, Any]:
         "duration": round(flight.duration, 3),
         "columns": list(own_table(flight)),
         "notes": list(flight.notes),
+        "consistency": consistency_table(flight),
     }
 
 

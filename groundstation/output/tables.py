@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -11,6 +12,7 @@ from rich.text import Text
 
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.results import Comparison, Diagnosis, EffectVerdict, WaterfallStep, WhereItFails
+from trueflight.models.flight import Flight
 from trueflight.models.model import Model
 
 VERDICT_STYLE = {
@@ -73,6 +75,14 @@ def print_comparisons(console: Console, comparisons: Sequence[Comparison]) -> No
         console.print(f"note: {note}", style="dim")
 
 
+def print_consistency(console: Console, flight: Flight) -> None:
+    """Which columns of the flight agree with each other."""
+    for check in flight.consistency:
+        told = f"; {check.text}" if check.text else ""
+        share = "" if np.isnan(check.left) else f" ({100 * check.left:.1f} % of the motion's energy apart)"
+        console.print(f"{check.pair}: {check.verdict}{share}{told}", highlight=False, markup=False)
+
+
 def print_where(console: Console, where: WhereItFails) -> None:
     """The regions that hold the error, and the worst moments."""
     console.print(Text("Where it fails", style="bold"))
@@ -125,6 +135,8 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
             f"effect: {'; '.join(d.unexplained.where)}. More: groundstation remainder FLIGHT",
             style="yellow",
         )
+    for note in d.flight.notes:
+        console.print(f"note: {escape(note)}", style="dim")
     if absent := d.named("not_supported"):
         console.print(f"[dim]Looked for and not there:[/dim] {', '.join(absent)}", highlight=False)
     for e in d.effects:

@@ -10,7 +10,8 @@ import numpy as np
 
 from trueflight.groundstation.reading import plausible, rows
 from trueflight.groundstation.reading.airborne import flying_mask
-from trueflight.groundstation.reading.uniform import MOST_LOST, even_clock
+from trueflight.groundstation.reading.consistency import reconcile, refusal
+from trueflight.groundstation.reading.uniform import MOST_LOST, even_clock, slopes
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.vehicle import Vehicle
@@ -46,9 +47,10 @@ def assemble(
         every["commanded"] = np.asarray(commanded, dtype=bool)
     t, every, mended = _whole_rows(t, every, names, place)
     plausible.check_units({name: every[name] for name in names}, vehicle, origin)
+    every, wrong_voltage = plausible.without_wrong_voltage(every, vehicle)
     t, every, resampled = even_clock(t, rows.continuous(every), origin, most_lost)
-    said = [*notes, *dead, *mended, *resampled]
-    given = {name: every[name] for name in names}
+    said = [*notes, *dead, *mended, *wrong_voltage, *resampled]
+    given = {name: every[name] for name in names if name in every}
     if "thrust_command" not in given:
         given["thrust_command"] = given["motor_command"].mean(axis=1)
         said.append("no collective command in the log: thrust_command is the mean of the motor commands")
@@ -56,20 +58,28 @@ def assemble(
     if commanded is not None:
         in_air = in_air & every["commanded"]
     said += _left_out(t, in_air, said, origin)
+    plausible.check_sensors(t, given, in_air, origin)
     plausible.check_specific_force(given, in_air, origin)
-    plausible.check_attitude(t, given, in_air, origin)
-    plausible.check_motion(t, given, in_air, origin)
+    if "position" in given and "velocity" not in given:
+        given["velocity"] = slopes(t, given["position"])
+        said.append("no velocity in the log: differentiated from the position")
+    agreed = reconcile(t, given, in_air)
+    if wrong := refusal(agreed.checks):
+        raise InputError(f"{origin}: {wrong}")
+    extras = {n.removeprefix("extra "): column for n, column in every.items() if n.startswith("extra ")}
     return Flight(
         name=path.stem,
         vehicle=vehicle,
-        t=t,
-        **given,  # type: ignore[arg-type]
-        flying=in_air,
+        t=t[agreed.keep],
+        **agreed.columns,  # type: ignore[arg-type]
+        flying=in_air[agreed.keep],
         accelerometer="specific_force" in given,
+        sensor_rate=agreed.rates.get("specific_force" if "specific_force" in given else "velocity"),
         origin=origin,
         data_hash=hashlib.sha256(path.read_bytes()).hexdigest(),
-        notes=tuple(said),
-        extra={n.removeprefix("extra "): column for n, column in every.items() if n.startswith("extra ")},
+        notes=(*said, *agreed.notes),
+        extra={name: column[agreed.keep] for name, column in extras.items()},
+        consistency=agreed.checks,
     )
 
 

@@ -61,10 +61,14 @@ def read_csv_text(path: Path) -> CsvText:
     if body and not body[-1].endswith(("\n", "\r")) and body[-1].count(delimiter) < first.count(delimiter):
         body.pop()
         notes.append("the last line is cut short and was left out")
-    joined = "".join(rows)
-    decimal = "," if delimiter != "," and "," in joined and "." not in joined else "."
+    # the first rows may hold whole numbers only
+    decimal = "," if delimiter != "," and _any(body, ",") and not _any(body, ".") else "."
     content = "".join([first, "\n", *body]).encode()
     return CsvText(content, delimiter, decimal, below, tuple(notes))
+
+
+def _any(lines: list[str], mark: str) -> bool:
+    return any(mark in line for line in lines)
 
 
 def _decoded(raw: bytes) -> tuple[str, list[str]]:

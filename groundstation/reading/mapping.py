@@ -21,7 +21,12 @@ Quantities are the attributes of `Flight` (`models.flight.COLUMNS`), and
   force through the attitude.
 
 Each takes `unit`, `sign` (a number, or one for each column), `frame`; a quaternion also `order` and
-`inverse = true` where it turns world into body.
+`inverse = true` where it turns world into body. What the reader found wrong is mended by
+* `turned = 20` (vectors): the log's frame is turned by so many degrees about z, anticlockwise from above; it is
+  turned back;
+* `axes = ["y", "-x", "z"]` (vectors): our x, y, z are these axes of the log's; `axes = "body"` for a velocity along the
+  body's axes;
+* `late = 0.1`: the values come so many seconds after what they tell, and are shifted back.
 """
 
 from __future__ import annotations
@@ -32,6 +37,7 @@ from pathlib import Path
 
 import numpy as np
 
+from trueflight.groundstation.reading.faults import about_z
 from trueflight.groundstation.reading.table import Table
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS
@@ -41,6 +47,7 @@ from trueflight.models.frames import (
     flu_from_frd,
     heading_from_world,
     quaternion_from_euler,
+    rotate,
     rotate_inverse,
 )
 from trueflight.models.outside import numbers, read_toml, shown
@@ -63,12 +70,18 @@ UNITS: dict[str, dict[str, tuple[float, float]]] = {
         "rev/s": (2 * np.pi, 0.0),
     },
     "V": {"V": (1.0, 0.0), "mV": (1e-3, 0.0)},
-    "1": {"1": (1.0, 0.0), "percent": (1e-2, 0.0), "u16": (1 / 65535, 0.0), "pwm": (1e-3, 1000.0)},
+    "1": {
+        "1": (1.0, 0.0),
+        "percent": (1e-2, 0.0),
+        "u16": (1 / 65535, 0.0),
+        "pwm": (1e-3, 1000.0),
+        "dshot": (1 / 1999, 48.0),
+    },
 }
 
 WORLD = ("position", "velocity", "position_reference", "velocity_reference", "acceleration_reference")
 BODY = ("angular_velocity", "specific_force", "body_rate_command")
-_KEYS = {"column", "columns", "unit", "sign", "frame"}
+_KEYS = {"column", "columns", "unit", "sign", "frame", "late"}
 _SPECIAL = {"time": "s", "attitude": "rad", "world_acceleration": "m/s^2"}
 
 
@@ -105,9 +118,13 @@ def load_mapping(path: Path) -> Mapping:
             raise InputError(f"{source}: unknown quantity '{name}'; {_suggestion(name, known)}")
         if not isinstance(entry, dict):
             raise InputError(f"{source}: '{name}' must be a table, [{name}] with column = \"...\"")
-        allowed = {"roll", "pitch", "yaw", "unit", "sign", "frame"} if name == "attitude" else set(_KEYS)
+        allowed = (
+            {"roll", "pitch", "yaw", "unit", "sign", "frame", "late"} if name == "attitude" else set(_KEYS)
+        )
         if name == "quaternion":
             allowed |= {"order", "inverse"}
+        if name in (*WORLD, *BODY):
+            allowed |= {"turned", "axes"}
         for key in entry:
             if key not in allowed:
                 hint = _suggestion(key, sorted(allowed))
@@ -148,8 +165,65 @@ def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTab
             columns["quaternion"], world + np.array([0.0, 0.0, GRAVITY])
         )
         notes.append("the specific force is the logged world acceleration plus gravity, in body axes")
+    columns = _mended(mapping, t, columns)
     extra = {name: column for name, column in table.columns.items() if name not in used}
     return MappedTable(t - t[0], columns, extra, tuple(notes))
+
+
+def _mended(mapping: Mapping, t: np.ndarray, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns turned, exchanged and shifted as the mapping says. Delays first, for a body's velocity is turned by the
+    attitude of its own time."""
+    out = dict(columns)
+    for name, entry in mapping.quantities.items():
+        if "late" in entry and name in (*out, "attitude"):
+            column = "quaternion" if name == "attitude" else name
+            out[column] = _shifted(t, out[column], _number(mapping.source, name, "late", entry["late"], "s"))
+    for name, entry in mapping.quantities.items():
+        if "turned" in entry and name in out:
+            angle = np.radians(_number(mapping.source, name, "turned", entry["turned"], "degrees"))
+            out[name] = out[name] @ about_z(-angle).T
+        if "axes" in entry and name in out:
+            out[name] = _by_axes(mapping.source, name, entry["axes"], out)
+    return out
+
+
+def _shifted(t: np.ndarray, column: np.ndarray, late: float) -> np.ndarray:
+    """A column (N,) or (N, k) as it was `late` s later."""
+    flat = column.reshape(len(t), -1)
+    known = np.isfinite(t) & np.isfinite(flat.sum(axis=1))
+    if known.sum() < 2:
+        return column
+    out = np.stack([np.interp(t + late, t[known], one[known]) for one in flat.T], -1)
+    out[~known] = np.nan
+    return out.reshape(column.shape)
+
+
+def _by_axes(source: str, name: str, axes: object, columns: dict[str, np.ndarray]) -> np.ndarray:
+    """A vector (N, 3) whose x, y, z are the given axes of the log's."""
+    if axes == "body" and name in ("velocity", "velocity_reference"):
+        if "quaternion" not in columns:
+            raise InputError(
+                f'{source}: [{name}] axes = "body" needs an attitude; map [quaternion] or [attitude]'
+            )
+        return rotate(columns["quaternion"], columns[name])
+    words = axes if isinstance(axes, list) else []
+    letters = [str(word).lstrip("-") for word in words]
+    if sorted(letters) != ["x", "y", "z"]:
+        body = ' or "body"' if name == "velocity" else ""
+        raise InputError(
+            f'{source}: [{name}] axes must be a list like ["y", "-x", "z"]{body}, not {shown(axes)}'
+        )
+    out = np.empty_like(columns[name])
+    for k, word in enumerate(words):
+        out[:, k] = (-1.0 if str(word).startswith("-") else 1.0) * columns[name][:, "xyz".index(letters[k])]
+    return out
+
+
+def _number(source: str, name: str, key: str, given: object, unit: str) -> float:
+    value = numbers(given, ())
+    if value is None:
+        raise InputError(f"{source}: [{name}] {key} must be a number ({unit}), not {shown(given)}")
+    return float(value)
 
 
 def _quantity(

@@ -10,17 +10,23 @@ from collections.abc import Callable
 
 import numpy as np
 
-from trueflight.groundstation.reading.uniform import segments
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS
-from trueflight.models.frames import rotate
 from trueflight.models.vehicle import GRAVITY, Vehicle
 
 LOWEST_RATE = 10.0  # Hz; below it neither rates nor drag can be told from noise
 SHORTEST = 2.0  # s
 
 HIGHEST_RATE = 60.0  # rad/s; a racing quadrotor reaches 35
-HIGHEST_VOLTAGE = 1000.0
+HIGHEST_FORCE = 16.0 * GRAVITY  # m/s²; the range of most accelerometers on flight controllers
+MOST_BEYOND = 0.01  # share of the flight; an impact takes some samples
+CELL = 3.7  # V nominal, lithium polymer
+PACK = (0.6, 1.4)
+"""Voltage over nominal: 2.8 V a cell where nominal was said of full cells, to 4.35 V where of empty ones."""
+MILLIVOLTS = (600.0, 1400.0)
+COEFFICIENT = (5e-4, 0.15)
+"""Thrust over air density, disk area and squared tip speed; propellers have 0.004 to 0.03, in rpm 91 times less."""
+AIR_DENSITY = 1.2  # kg/m³
 
 
 def check_clock(t: np.ndarray, place: Callable[[int], str]) -> None:
@@ -82,13 +88,17 @@ def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -
     if (u := columns.get("thrust_command")) is not None:
         _check_thrust(u, origin)
     if (volts := columns.get("battery_voltage")) is not None:
-        level = float(np.median(volts))
-        if level > 20 * vehicle.nominal_voltage:
+        level = float(np.nanmedian(volts))
+        if MILLIVOLTS[0] < level / vehicle.nominal_voltage < MILLIVOLTS[1] and abs(level - 65535.0) > 1.0:
             raise InputError(
                 f"{origin}: battery_voltage is {level:.0f} V, the vehicle's nominal voltage "
                 f"{vehicle.nominal_voltage:g} V; "
                 'is it in mV? Map it with unit = "mV"'
             )
+    if (motors := columns.get("motor_command")) is not None:
+        _check_motors(motors, origin)
+    if (speed := columns.get("rotor_speed")) is not None:
+        _check_rotor_speed(speed, vehicle, origin)
     if (
         (yaw := columns.get("yaw_reference")) is not None
         and np.ptp(np.diff(yaw)) > 0
@@ -97,6 +107,52 @@ def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -
         raise InputError(
             f'{origin}: yaw_reference reaches {_high(yaw[:, None]):.0f} rad; in degrees? Use unit = "deg"'
         )
+
+
+def without_wrong_voltage(
+    columns: dict[str, np.ndarray], vehicle: Vehicle
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """A voltage that no pack of the vehicle's nominal voltage has is left out, with the likely unit in a note: what a
+    battery does cannot be judged from it, and a flight needs no voltage."""
+    volts = columns.get("battery_voltage")
+    if volts is None:
+        return columns, []
+    level, nominal = float(np.nanmedian(volts)), vehicle.nominal_voltage
+    if PACK[0] <= level / nominal <= PACK[1] or MILLIVOLTS[0] < level / nominal < MILLIVOLTS[1]:
+        return columns, []
+    cells = round(nominal / CELL)
+    if abs(level - 65.535) < 0.01 or abs(level - 65535.0) < 1.0:
+        guess = "65535 is what drivers write that have no reading"
+    elif cells > 1 and PACK[0] <= level / CELL <= PACK[1]:
+        guess = f'per cell of {cells}? Map it with unit = "V", or multiply it by {cells}'
+    elif np.nanmin(volts) >= 0.0 and np.nanmax(volts) <= 1.001:
+        guess = "a share of the charge? It must be in volts"
+    elif np.nanmax(volts) <= 100.5 and level > PACK[1] * nominal:
+        guess = "in percent? It must be in volts"
+    elif PACK[0] <= 1e-3 * level / nominal <= PACK[1]:
+        guess = 'in mV? Map it with unit = "mV"'
+    else:
+        guess = "correct nominal_voltage of the vehicle file, or the unit"
+    note = f"the battery voltage, {level:.3g} V, is implausible for {nominal:g} V nominal and was left out ({guess})"
+    return {name: column for name, column in columns.items() if name != "battery_voltage"}, [note]
+
+
+def check_sensors(t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndarray, origin: str) -> None:
+    """Readings beyond what sensors of a flight controller can tell: a column that runs away, or another quantity."""
+    for name, limit, unit in (
+        ("specific_force", HIGHEST_FORCE, "m/s^2"),
+        ("angular_velocity", HIGHEST_RATE, "rad/s"),
+    ):
+        if (column := columns.get(name)) is None:
+            continue
+        beyond = flying & (np.max(np.abs(column), axis=1) > limit)
+        if np.sum(beyond) > MOST_BEYOND * np.sum(flying):
+            row = int(np.argmax(beyond))
+            raise InputError(
+                f"{origin}: {COLUMNS[name][2]} is beyond {limit:.0f} {unit} from t = {t[row]:.1f} s on, in "
+                f"{100 * np.sum(beyond) / np.sum(flying):.0f} % of the flight: the sensor or its export ran away; "
+                "cut the flight, or leave the column out"
+            )
 
 
 def check_specific_force(columns: dict[str, np.ndarray], flying: np.ndarray, origin: str) -> None:
@@ -134,106 +190,61 @@ def check_specific_force(columns: dict[str, np.ndarray], flying: np.ndarray, ori
         )
 
 
-def check_attitude(t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndarray, origin: str) -> None:
-    """The attitude must turn as the gyroscope says: tells the order w, x, y, z from x, y, z, w, body-to-world
-    from world-to-body, and radians from degrees. Silent where the flight turns too little to tell."""
-    q, w = columns.get("quaternion"), columns.get("angular_velocity")
-    if q is None or w is None:
-        return
-    dt = float(np.median(np.diff(t)))
-    stride = max(1, round(0.04 / dt))  # 40 ms: above the noise of an attitude estimate, below its manoeuvres
-    rows = np.concatenate([np.arange(s.start, s.stop - stride) for s in segments(t)])
-    rows = rows[flying[rows] & flying[rows + stride]]
-    if len(rows) < 100:
-        return
-    mean = np.concatenate([np.zeros((1, 3)), np.cumsum(w, axis=0)])
-    gyro = (mean[rows + stride] - mean[rows]) / stride
-    if np.sqrt(np.mean(gyro**2)) < 0.05:
-        return
-    seconds = stride * dt
-
-    def score(quaternion: np.ndarray) -> tuple[float, float]:
-        turned = body_rate(quaternion[rows], quaternion[rows + stride], seconds)
-        slope = float(np.sum(turned * gyro) / np.sum(gyro**2))
-        return float(np.sum(turned * gyro) / np.sqrt(np.sum(turned**2) * np.sum(gyro**2) + 1e-30)), slope
-
-    agreement, slope = score(q)
-    if agreement > 0.5:
-        if slope < 0.1:
-            raise InputError(
-                f"{origin}: angular_velocity is {1 / slope:.0f} times what the attitude turns; is it in "
-                "deg/s? "
-                'Convert it to rad/s, or map it with unit = "deg/s"'
-            )
-        return
-    others = {
-        'the columns look like x, y, z, w; name them so, or map them with order = "xyzw"': q[:, [3, 0, 1, 2]],
-        "it looks like world to body; take its conjugate (or map it with inverse = true)": q
-        * [1, -1, -1, -1],
-        'it looks like FRD axes (map attitude and rates with frame = "ned_frd")': q * [1, 1, -1, -1],
-    }
-    hint, best = max(((text, score(other)[0]) for text, other in others.items()), key=lambda pair: pair[1])
-    if best > 0.8 and best > agreement + 0.4:
-        raise InputError(f"{origin}: the quaternion does not turn as angular_velocity says; {hint}")
-
-
-def check_motion(t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndarray, origin: str) -> None:
-    """Velocity must be the derivative of position, and its own derivative must be the rotated specific
-    force."""
-    p, v = columns.get("position"), columns.get("velocity")
-    half_second = max(1, round(0.5 / float(np.median(np.diff(t)))))
-    rows = np.concatenate(
-        [np.arange(s.start, s.stop - half_second) for s in segments(t)] or [np.array([], int)]
-    )
-    rows = rows[flying[rows] & flying[rows + half_second]]
-    if v is None or len(rows) < 2 * half_second:
-        return
-    seconds = (t[rows + half_second] - t[rows])[:, None]
-    if p is not None:
-        moved = p[rows + half_second] - p[rows]
-        integral = np.concatenate([np.zeros((1, 3)), np.cumsum(v, axis=0)])
-        expected = (integral[rows + half_second] - integral[rows]) / half_second * seconds
-        if np.sqrt(np.mean(expected**2)) > 0.02:
-            scale, agreement = _slope(expected, moved)
-            if agreement > 0.9 and not 0.5 < scale < 2:
-                raise InputError(
-                    f"{origin}: position moves {scale:.3g} times as far as velocity says; check the units "
-                    "of both "
-                    "(m and m/s)"
-                )
-            for axis, name in enumerate("xyz"):
-                _one, agree = _slope(expected[:, axis], moved[:, axis])
-                if agree < -0.8 and np.std(expected[:, axis]) > 0.05:
-                    raise InputError(
-                        f"{origin}: velocity_{name} has the opposite sign of position_{name}'s motion; "
-                        "give both in "
-                        'world ENU, or map them with frame = "ned_frd"'
-                    )
-    q, f = columns.get("quaternion"), columns.get("specific_force")
-    if q is None or f is None:
-        return
-    gained = (v[rows + half_second] - v[rows]) / seconds
-    world = rotate(q, f) - np.array([0, 0, GRAVITY])
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(world, axis=0)])
-    felt = (integral[rows + half_second] - integral[rows]) / half_second
-    for axes, names in (((0, 1), "horizontal"), ((2,), "vertical")):
-        a, b = gained[:, axes] - gained[:, axes].mean(0), felt[:, axes] - felt[:, axes].mean(0)
-        _, agreement = _slope(a, b)
-        if agreement < -0.7 and min(np.std(a), np.std(b)) > 0.3:
-            raise InputError(
-                f"{origin}: the {names} velocity gains the opposite of what accelerometer and attitude "
-                "say; the frames "
-                'disagree: world ENU, body FLU are needed (map a NED log with frame = "ned_frd")'
-            )
-
-
 def body_rate(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
     """Mean body rates (N, 3) in rad/s that turn attitudes `start` (N, 4) into `end` (N, 4)."""
     w0, v0 = start[:, :1], -start[:, 1:]
     w1, v1 = end[:, :1], end[:, 1:]
     scalar = w0 * w1 - np.sum(v0 * v1, axis=1, keepdims=True)
     vector = w0 * v1 + w1 * v0 + np.cross(v0, v1)
-    return 2.0 * np.sign(np.where(scalar == 0, 1.0, scalar)) * vector / seconds
+    vector = np.sign(np.where(scalar == 0, 1.0, scalar)) * vector
+    sine = np.linalg.norm(vector, axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
+    return np.asarray(vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 2.0) / seconds)
+
+
+def _check_motors(motors: np.ndarray, origin: str) -> None:
+    high, low = float(np.nanquantile(motors, 0.999)), float(np.nanquantile(motors, 0.001))
+    if high <= 1.5 and low >= -1.05:
+        return
+    if low >= 900 and high <= 2500:
+        guess = 'microseconds of PWM? Map it with unit = "pwm"'
+    elif low >= 0 and high <= 2100 and high > 105:
+        guess = 'DShot (48 to 2047)? Map it with unit = "dshot"'
+    elif low >= 0 and high <= 105:
+        guess = 'in percent? Map it with unit = "percent"'
+    elif high <= 66000 and low >= 0:
+        guess = 'a 16-bit command? Map it with unit = "u16"'
+    else:
+        guess = "give them as 0 to 1 of full throttle"
+    raise InputError(
+        f"{origin}: motor commands reach from {low:.4g} to {high:.4g}, but their unit is 0 to 1 of full throttle; "
+        f"{guess}"
+    )
+
+
+def _check_rotor_speed(speed: np.ndarray, vehicle: Vehicle, origin: str) -> None:
+    """The thrust coefficient that carries the vehicle's weight at the median speed must be a propeller's."""
+    radius, places = vehicle.rotor_radius, np.array(vehicle.rotor_positions)
+    if len(places) < 2 or not np.any(speed > 0.0):
+        return
+    apart = min(float(np.linalg.norm(places[0] - other)) for other in places[1:])
+    if not 0.1 * apart < radius < 0.6 * apart:  # the radius was not measured
+        return
+    median = float(np.median(speed[speed > 0.0]))
+    thrust = vehicle.weight / max(len(vehicle.rotor_positions), 1)
+    coefficient = thrust / (AIR_DENSITY * np.pi * radius**2 * (median * radius) ** 2)
+    if COEFFICIENT[0] <= coefficient <= COEFFICIENT[1]:
+        return
+    for unit, factor in (("rpm", np.pi / 30), ("rev/s", 2 * np.pi)):
+        if COEFFICIENT[0] <= coefficient / factor**2 <= COEFFICIENT[1]:
+            raise InputError(
+                f"{origin}: rotor speeds of {median:.0f} rad/s do not fit rotors of {radius:.3g} m that carry "
+                f'{vehicle.mass:.3g} kg; are they in {unit}? Map them with unit = "{unit}"'
+            )
+    raise InputError(
+        f"{origin}: rotor speeds of {median:.0f} rad/s do not fit rotors of {radius:.3g} m that carry "
+        f"{vehicle.mass:.3g} kg; check their unit (rad/s), and mass and rotor_radius of the vehicle file"
+    )
 
 
 def _check_thrust(u: np.ndarray, origin: str) -> None:
@@ -255,12 +266,6 @@ def _check_thrust(u: np.ndarray, origin: str) -> None:
     else:
         guess = "divide it by full collective"
     raise InputError(f"{origin}: thrust_command reaches {high:.4g}, it is 0 to 1 of full collective; {guess}")
-
-
-def _slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope of y over x without intercept, and their correlation without centring."""
-    xy, xx, yy = float(np.sum(x * y)), float(np.sum(x * x)), float(np.sum(y * y))
-    return xy / (xx + 1e-30), xy / (np.sqrt(xx * yy) + 1e-30)
 
 
 def _high(column: np.ndarray) -> float:

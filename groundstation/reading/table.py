@@ -45,13 +45,15 @@ MOST_RAGGED = 0.02
 @dataclass(frozen=True)
 class Table:
     """Columns (N,) of floats by name; missing values are nan. `origin` names the file in messages; row i of a
-    CSV is line i + `first_line` of the file, but for the lines that were `left_out`; a Parquet row has no line."""
+    CSV is line i + `first_line` of the file, but for the lines that were `left_out`; a Parquet row has no line. Columns
+    that hold text or lists are not read; `text` names them."""
 
     origin: str
     columns: dict[str, np.ndarray]
     notes: tuple[str, ...] = ()
     first_line: int | None = 2
     left_out: tuple[int, ...] = ()
+    text: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -73,7 +75,12 @@ class Table:
         hint = (
             f"did you mean '{close[0]}'?" if close else f"the file has: {', '.join(list(self.columns)[:30])}"
         )
-        raise InputError(f"{self.origin}: column '{name}'{wanted_by} is missing; {hint}")
+        texts = (
+            f"; {', '.join(self.text[:9])} hold text or lists, which are not read: one number a column"
+            if self.text
+            else ""
+        )
+        raise InputError(f"{self.origin}: column '{name}'{wanted_by} is missing; {hint}{texts}")
 
 
 def read_table(path: Path) -> Table:
@@ -85,6 +92,23 @@ def read_table(path: Path) -> Table:
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path)
     return _read_csv(path)
+
+
+def _text_columns(arrow: Any) -> list[str]:
+    """Names of columns that hold text, or lists."""
+    import pyarrow as pa
+
+    numeric = (
+        pa.types.is_integer,
+        pa.types.is_floating,
+        pa.types.is_boolean,
+        pa.types.is_temporal,
+        pa.types.is_null,
+    )
+    pairs = zip(arrow.column_names, arrow.columns, strict=True)
+    return [
+        name.strip().lstrip("#").strip() for name, c in pairs if not any(kind(c.type) for kind in numeric)
+    ]
 
 
 def own_columns(table: Table) -> dict[str, np.ndarray]:
@@ -157,7 +181,12 @@ def _read_csv(path: Path) -> Table:
         if name and count > 1:
             raise InputError(f"{path}: two columns are named {shown(name)}; rename or remove one")
     return Table(
-        str(path), _numbers(str(path), arrow, text.first_line), tuple(notes), text.first_line, tuple(ragged)
+        str(path),
+        _numbers(str(path), arrow, text.first_line),
+        tuple(notes),
+        text.first_line,
+        tuple(ragged),
+        tuple(_text_columns(arrow)),
     )
 
 
@@ -172,7 +201,7 @@ def _read_parquet(path: Path) -> Table:
                 f"{path}: claims {about.num_rows} rows of {about.num_columns} columns; export it again"
             )
         arrow = arrow_parquet.read_table(path)
-        return Table(str(path), _numbers(str(path), arrow, None), (), None)
+        return Table(str(path), _numbers(str(path), arrow, None), (), None, (), tuple(_text_columns(arrow)))
 
 
 def _numbers(origin: str, arrow: object, first_line: int | None) -> dict[str, np.ndarray]:

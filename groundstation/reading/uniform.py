@@ -96,6 +96,15 @@ def interpolate(
     return out / np.linalg.norm(out, axis=1, keepdims=True) if unit_quaternion else out
 
 
+def slopes(t: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Derivative of a column (N, k) on an even clock `t` (N,), within each segment."""
+    out = np.zeros_like(column)
+    for part in segments(t):
+        if part.stop - part.start > 1:
+            out[part] = np.gradient(column[part], t[part], axis=0)
+    return out
+
+
 def continuous_quaternion(quaternion: np.ndarray) -> np.ndarray:
     """Quaternions (N, 4) with signs chosen so that neighbours are near each other (q and -q are one
     attitude)."""

@@ -103,10 +103,10 @@ BAD = {
         ["quaternion is not unit", "unit quaternion"],
     ),
     "quaternion in degrees": (scaled("quaternion", 57.3), ["quaternion is not unit", "degrees"]),
-    "quaternion xyzw": (as_xyzw, ["does not turn as angular_velocity says", "x, y, z, w", 'order = "xyzw"']),
+    "quaternion xyzw": (as_xyzw, ["attitude and gyroscope", "contradict", "x, y, z, w", 'order = "xyzw"']),
     "quaternion world to body": (
         conjugated,
-        ["does not turn as angular_velocity says", "world to body", "conjugate"],
+        ["attitude and gyroscope", "contradict", "world to body", "inverse = true"],
     ),
     "rates in deg/s": (scaled("angular_velocity", 57.29578), ["deg/s", "Convert it to rad/s"]),
     "commanded rates in deg/s": (scaled("body_rate_command", 57.29578), ["commanded body rates", "deg/s"]),
@@ -124,10 +124,10 @@ BAD = {
     "thrust in percent": (scaled("thrust_command", 100.0), ["percent"]),
     "thrust down": (scaled("thrust_command", -1.0), ["up is positive", "sign = -1"]),
     "battery in mV": (scaled("battery_voltage", 1e3), ["in mV", 'unit = "mV"']),
-    "position in mm": (scaled("position_", 1e3), ["position moves", "units of both"]),
+    "position in mm": (scaled("position_", 1e3), ["position and velocity contradict", 'unit = "mm"']),
     "velocity down": (
         lambda c: {**c, "velocity_y": -c["velocity_y"]},
-        ["velocity_y has the opposite sign", "ned_frd"],
+        ["velocity is in other axes", 'axes = ["x", "-y", "z"]'],
     ),
     "too short": (
         lambda c: {n: v[:150] for n, v in c.items()},

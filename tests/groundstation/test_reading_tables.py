@@ -245,7 +245,8 @@ def test_takeoff_and_landing_are_cut_by_height(flight, tmp_path):
     thrust = np.where((t > 2.0) & (t < 11.5), flight.vehicle.hover_thrust, 0.0)
     still = np.zeros(n)
     columns = {"t": t, "position_x": still, "position_y": still, "position_z": 7.0 + height}
-    columns |= {f"velocity_{a}": still for a in "xyz"} | {f"specific_force_{a}": still for a in "xy"}
+    columns |= {f"velocity_{a}": still for a in "xy"} | {"velocity_z": np.gradient(height, t)}
+    columns |= {f"specific_force_{a}": still for a in "xy"}
     columns |= {"specific_force_z": still + GRAVITY, "thrust_command": thrust}
     flown = read_flight(write(tmp_path / "hop.csv", columns), flight.vehicle)
     air = flown.t[flown.flying]

@@ -195,11 +195,12 @@ def test_odometry_and_imu_of_ros_stand_in(twist_in_world, tmp_path):
     np.testing.assert_allclose(flight.body_rate_command[rows], flown().body_rate_command[same], atol=0.2)
 
 
-def test_a_pose_alone_gives_a_flight_without_velocity(tmp_path):
+def test_a_pose_alone_gives_a_flight_whose_velocity_is_differentiated(tmp_path):
     flight = read_flight(ros_messages(Bag(tmp_path / "bag.mcap"), odometry=False).save(), VEHICLE)
     agrees(flight, ("position", "specific_force", "angular_velocity"))
-    assert flight.velocity is None
+    assert flight.velocity is not None
     assert any("/mocap/pose" in note for note in flight.notes)
+    assert any("differentiated from the position" in note for note in flight.notes)
 
 
 def test_setpoints_on_another_clock_are_shifted_to_the_vehicles(tmp_path):

@@ -1,0 +1,290 @@
+"""Do the columns of a flight agree with each other?
+
+What physics ties together is compared over the moving parts of the flight: attitude turns as the gyroscope says,
+position moves as the velocity says, velocity grows as accelerometer and attitude say (without an accelerometer: as the
+tilt says). Where two columns disagree, every fault that logs are known for is tried on all pairs at once: another order
+or direction of the quaternion, axes exchanged, mirrored or turned about z, body for world, another unit. The fault that
+mends most is named. A small turn is told; a delay, a held value, a glitch and a jump are undone or cut out, and told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trueflight.groundstation.reading.breaks import Step, steps, told, without
+from trueflight.groundstation.reading.faults import (
+    Columns,
+    Fault,
+    about_z,
+    single_faults,
+    turn_between,
+    turned,
+    turned_about_z,
+)
+from trueflight.groundstation.reading.held import unheld
+from trueflight.groundstation.reading.pairs import FORCE, MOTION, ROTATION, TILT, Pair, Windows
+from trueflight.groundstation.reading.plausible import body_rate
+from trueflight.groundstation.reading.uniform import slopes
+from trueflight.models.flight import Check
+from trueflight.models.frames import rotate
+from trueflight.models.vehicle import GRAVITY
+
+DISAGREE, CONTRADICT = 0.5, 0.8
+"""Shares of the motion's energy left between two columns from which on they disagree, and from which on a flight is
+refused even where no known fault explains it. Smoothed estimates leave 0.3, strangers 2."""
+MENDED, BETTER = 0.35, 0.25
+"""A fault explains what two columns differ by if it leaves less than `MENDED` of the motion, and `BETTER` of that."""
+SURE = 10.0
+"""Log likelihood from which on a fault is believed."""
+CLEAN = 0.02
+"""Share left below which only mirrored axes are still looked for: one with little motion hides behind the others."""
+REFUSED_ANGLE = np.radians(15.0)
+"""Turn of one frame against another from which on a flight is refused: a quarter of the horizontal acceleration is
+then on the wrong axis."""
+TOLD_ANGLE = np.radians(4.0)
+"""Turn from which on it is told; compasses and motion capture are aligned within a few degrees."""
+LATEST, TOLD_LATE = 0.3, 0.015
+"""s of delay that are looked for, and from which on one is told and undone."""
+MOST_JUMPS, MOST_CUT = 5, 0.05
+"""Jumps of the heading, and share of the flight, beyond which what looks like steps is disagreement throughout."""
+
+
+@dataclass(frozen=True)
+class Reconciled:
+    """A flight's columns as they agree best: the rows (N,) to keep and their `columns`, what was found (`checks`), the
+    true rate in Hz of columns that were held (`rates`), and `notes` on what was done."""
+
+    keep: np.ndarray
+    columns: Columns
+    checks: tuple[Check, ...]
+    rates: dict[str, float]
+    notes: tuple[str, ...]
+
+
+def reconcile(t: np.ndarray, columns: Columns, flying: np.ndarray) -> Reconciled:
+    """Interpolate what is held, shift what is late, cut out what jumped, and compare the rest.
+
+    `t` (N,) in s, even within its stretches; `columns` (N, k) by the names of `models.flight.COLUMNS`; `flying` (N,).
+    """
+    columns, rates, notes = unheld(t, columns, flying)
+    windows = Windows(t, flying, rates)
+    columns, late = _undelayed(windows, columns, [p for p in windows.pairs(columns) if p.moves])
+    found = steps(t, columns, flying)
+    heading = [s for s in found if s.what == "heading" and not s.glitch]
+    if 0 < len(heading) <= MOST_JUMPS:
+        columns, said = _without_heading_jumps(windows, columns, heading)
+        notes += said
+        found = [s for s in steps(t, columns, flying) if s.what != "heading"] + heading
+    velocity = [s for s in found if s.what == "velocity"]
+    found = [s for s in found if s in velocity or not any(v.overlaps(s) for v in velocity)]
+    keep = without(t, found)
+    if np.sum(~keep & flying) > MOST_CUT * np.sum(flying):
+        keep, found = np.ones(len(t), dtype=bool), []
+    notes += told(t, found)
+    columns = {name: column[keep] for name, column in columns.items()}
+    columns, checks = _examined(Windows(t[keep], flying[keep], rates), columns, late)
+    notes += [c.text for c in checks if c.verdict in ("undone", "weak")]
+    return Reconciled(keep, columns, checks, rates, tuple(notes))
+
+
+def _examined(windows: Windows, columns: Columns, late: list[Check]) -> tuple[Columns, tuple[Check, ...]]:
+    """The columns with delays undone, and a check for every pair that they allow; `late` were undone before."""
+    pairs = windows.pairs(columns)
+    moving = [p for p in pairs if p.moves]
+    too_little = "the flight moves too little to compare them"
+    still = [Check(p.name, "cannot tell", float("nan"), too_little) for p in pairs if not p.moves]
+    fault = _likeliest(windows, columns, moving)
+    if fault is not None or any(p.left > DISAGREE for p in moving):
+        return columns, (*_disagreements(windows, columns, moving, fault), *still)
+    columns, later = _undelayed(windows, columns, moving)
+    moving = [p for p in windows.pairs(columns) if p.moves]
+    found = {c.pair: c for c in (*late, *later, *_small_turns(columns, moving))}
+    agreeing = [Check(p.name, "agrees", p.left) for p in moving if p.name not in found]
+    return columns, (*found.values(), *agreeing, *still)
+
+
+def refusal(checks: tuple[Check, ...]) -> str:
+    """The line with which a flight is refused, '' where it is not."""
+    wrong = [c for c in checks if c.verdict == "contradicts"]
+    if not wrong:
+        return ""
+    worst = max(wrong, key=lambda c: c.left)
+    advice = (
+        f"correct it, or map it (--mapping): {'; '.join(worst.mapping.splitlines())}"
+        if worst.mapping
+        else "compare the columns: two vehicles, a sensor that stopped, or different clocks?"
+    )
+    return f"{', '.join(dict.fromkeys(c.pair for c in wrong))} contradict each other: {worst.text}; {advice}"
+
+
+def _disagreements(
+    windows: Windows, columns: Columns, moving: list[Pair], fault: Fault | None
+) -> Iterator[Check]:
+    """A check for each pair, where some disagree or a `fault` was found."""
+    mended = {} if fault is None else {p.name: p.left for p in windows.pairs(fault.mend(columns))}
+    for pair in moving:
+        if fault is not None and mended[pair.name] < BETTER * pair.left:
+            yield Check(pair.name, "contradicts", pair.left, fault.cause, fault.mapping, fault.angle)
+        elif pair.left <= DISAGREE:
+            yield Check(pair.name, "agrees", pair.left)
+        else:
+            text = (
+                f"{pair.name} differ by {100 * min(pair.left, 9.99):.0f} % of the motion's energy, and no exchange of "
+                "axes, frames or units that is known mends it"
+            )
+            yield Check(pair.name, "contradicts" if pair.left > CONTRADICT else "weak", pair.left, text)
+
+
+def _likeliest(windows: Windows, columns: Columns, moving: list[Pair]) -> Fault | None:
+    """The fault that mends every pair that disagrees, is sure for one at least, and spoils none; or None."""
+    before = {p.name: p for p in moving}
+    faults: list[Fault] = [*single_faults(columns, all(p.left < CLEAN for p in moving))]
+    if any(p.left > DISAGREE for p in moving):
+        faults += _turns(windows, columns)
+    best: tuple[float, Fault] | None = None
+    for fault in faults:
+        after = {p.name: p.left for p in windows.mended(columns, moving, fault) if p.name in before}
+        if not all(left < MENDED or left <= before[name].left for name, left in after.items()):
+            continue
+        mended = {
+            n for n, p in before.items() if after[n] < BETTER * p.left and p.likelihood(after[n]) > SURE
+        }
+        if not mended or any(p.left > DISAGREE and n not in mended for n, p in before.items()):
+            continue
+        # what is left below 0.3 % is noise, and faults that differ by half a unit of log mend alike
+        misfit = sum(float(np.log(max(left, 0.003))) for left in after.values())
+        alike = best is not None and misfit < best[0] + 0.5 and fault.rank < best[1].rank
+        if best is None or misfit < best[0] - 0.5 or alike:
+            best = (misfit, fault)
+    return None if best is None else best[1]
+
+
+def _turns(windows: Windows, columns: Columns) -> Iterator[Fault]:
+    """Frames turned about z by the angle that fits best."""
+    pairs = {p.name: p for p in windows.pairs(columns) if len(p.one)}
+    path = pairs.get(FORCE) or pairs.get(TILT)
+    if path is not None:
+        angle, names = turn_between(path.other, path.one), _trajectory(columns)
+        cause = f"the frame of {' and '.join(names)} is turned by {{}} about z against that of the attitude"
+        yield turned(cause, angle, names, 1)
+    for names, cause in (
+        (("angular_velocity", "specific_force"), "the IMU is turned by {} about the body's z axis"),
+        (("angular_velocity",), "the gyroscope is turned by {} about the body's z axis"),
+        (("specific_force",), "the accelerometer is turned by {} about the body's z axis"),
+    ):
+        if "quaternion" in columns and all(n in columns for n in names):
+            yield turned(cause, _sensor_angle(windows, columns, names[0]), names, 2)
+    if (motion := pairs.get(MOTION)) is not None:
+        angle = turn_between(motion.one, motion.other)
+        yield turned(
+            "the velocity's frame is turned by {} about z against the position's", angle, ("velocity",), 3
+        )
+
+
+def _sensor_angle(windows: Windows, columns: Columns, name: str) -> float:
+    """The turn about body z of a sensor of the IMU, from what attitude and trajectory say that it should read."""
+    q, v = columns["quaternion"], columns.get("velocity")
+    if name == "angular_velocity":
+        rows = windows.rows(windows.turn)
+        turned = body_rate(q[rows], q[rows + windows.turn], windows.turn * windows.dt)
+        return turn_between(turned, windows.mean(columns[name], rows, windows.turn))
+    if v is None and "position" in columns:
+        v = slopes(windows.t, columns["position"])
+    if v is None:
+        return 0.0
+    rows = windows.rows(windows.move)
+    gained = (v[rows + windows.move] - v[rows]) / (windows.move * windows.dt) + [0.0, 0.0, GRAVITY]
+    inverse = q[rows + windows.move // 2] * [1.0, -1.0, -1.0, -1.0]
+    return turn_between(rotate(inverse, gained), windows.mean(columns[name], rows, windows.move))
+
+
+def _undelayed(windows: Windows, columns: Columns, moving: list[Pair]) -> tuple[Columns, list[Check]]:
+    """The columns without the delay of attitude, then of position and velocity, against the IMU, where it is sure."""
+    out, checks = dict(columns), []
+    names = {p.name for p in moving}
+    for name, shifted in ((ROTATION, ("quaternion",)), (FORCE, _trajectory(columns))):
+        late, left = _delay(windows, out, name) if name in names else (0.0, 0.0)
+        if abs(late) < TOLD_LATE:
+            continue
+        for n in shifted:
+            out[n] = windows.earlier(out[n], late, n == "quaternion")
+        what = "the attitude" if name == ROTATION else " and ".join(shifted)
+        side = "later" if late > 0 else "earlier"
+        text = f"{what} lagged the IMU: {1e3 * abs(late):.0f} ms {side}, shifted back"
+        mapping = "\n".join(f"[{n}] late = {late:.3f}" for n in shifted)
+        checks.append(Check(name, "undone", left, text, mapping, late=late))
+    return out, checks
+
+
+def _delay(windows: Windows, columns: Columns, name: str) -> tuple[float, float]:
+    """How late (s) attitude or trajectory is against the IMU, and the share left then; 0 where it is not sure."""
+    step = max(1, round(0.005 / windows.dt))
+    reach = int(LATEST / windows.dt) // step * step
+    shifts = np.arange(-reach, reach + 1, step)
+    pairs = [next(p for p in windows.pairs(columns, int(shift), reach) if p.name == name) for shift in shifts]
+    left = np.array([p.left for p in pairs])
+    here, best = pairs[reach // step], int(np.argmin(left))
+    if not here.moves or best in (0, len(left) - 1):
+        return 0.0, here.left
+    if here.likelihood(left[best]) < SURE or left[best] > 0.5 * here.left:
+        return 0.0, here.left
+    curve = left[best - 1] - 2 * left[best] + left[best + 1]
+    vertex = 0.5 * (left[best - 1] - left[best + 1]) / curve if curve > 0 else 0.0
+    return float((shifts[best] + vertex * step) * windows.dt), float(left[best])
+
+
+def _small_turns(columns: Columns, moving: list[Pair]) -> Iterator[Check]:
+    """A turn about z between trajectory and attitude, and between IMU and attitude, where it is sure."""
+    for pair in moving:
+        if pair.name == MOTION:
+            continue
+        names: tuple[str, ...] = _trajectory(columns)
+        cause = f"the frame of {' and '.join(names)} is turned by {{}} about z against that of the attitude"
+        one, other = pair.other, pair.one
+        if pair.name == ROTATION:
+            names, cause = ("angular_velocity",), "the gyroscope is turned by {} about the body's z axis"
+            one, other = pair.one, pair.other
+        fault = turned(cause, turn_between(one, other), names, 0)
+        turn = about_z(-fault.angle)[: other.shape[1], : other.shape[1]]
+        left = replace(pair, one=one, other=other @ turn.T).left
+        spread = np.sqrt(left * pair.window / (2.0 * pair.seconds))
+        if abs(fault.angle) < max(TOLD_ANGLE, 3.0 * spread) or pair.likelihood(left) < SURE:
+            continue
+        refused = abs(fault.angle) >= REFUSED_ANGLE
+        text = fault.cause + ("" if refused else ": forces along x and y mix by as much")
+        verdict = "contradicts" if refused else "weak"
+        yield Check(pair.name, verdict, pair.left, text, fault.mapping, fault.angle)
+
+
+def _without_heading_jumps(
+    windows: Windows, columns: Columns, jumps: list[Step]
+) -> tuple[Columns, list[str]]:
+    """The attitude with jumps of its heading undone: what came before is turned, or what came after, whichever fits the
+    trajectory; a jump that neither mends stays."""
+    t, notes = windows.t, []
+
+    def left(some: Columns) -> float:
+        return next((p.left for p in windows.pairs(some) if p.name in (FORCE, TILT) and p.moves), np.inf)
+
+    for jump in jumps:
+        q, earlier = columns["quaternion"], (np.arange(len(t)) < jump.last)[:, None]
+        ways = {
+            "before": np.where(earlier, turned_about_z(q, jump.size), q),
+            "after": np.where(earlier, q, turned_about_z(q, -jump.size)),
+        }
+        side = min(ways, key=lambda way: left({**columns, "quaternion": ways[way]}))
+        mended = {**columns, "quaternion": ways[side]}
+        if left(mended) < BETTER * left(columns):
+            columns = mended
+            notes.append(
+                f"the heading {side} its jump at t = {t[jump.first]:.2f} s was turned by "
+                f"{np.degrees(abs(jump.size)):.0f} degrees: velocity and accelerometer agree then"
+            )
+    return columns, notes
+
+
+def _trajectory(columns: Columns) -> tuple[str, ...]:
+    return tuple(n for n in ("position", "velocity") if n in columns)

@@ -1,0 +1,191 @@
+"""Pairs of columns that physics ties together, compared over short windows of a flight."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trueflight.groundstation.reading.faults import Columns, Fault
+from trueflight.groundstation.reading.plausible import body_rate
+from trueflight.groundstation.reading.uniform import continuous_quaternion, segments, slopes
+from trueflight.models.frames import rotate
+from trueflight.models.vehicle import GRAVITY
+
+TURN = 0.25
+"""s over which attitude and gyroscope are compared: above the noise of both, below most manoeuvres."""
+MOVE = 0.5
+"""s over which position, velocity and acceleration are compared."""
+TURNS, MOVES, GAINS = 0.05, 0.05, 0.3
+"""RMS in rad/s, m/s and m/s² from which on a flight moves enough to know; below, biases and noise decide."""
+ENOUGH = 5.0
+"""s of motion without which nothing is said."""
+
+ROTATION = "attitude and gyroscope"
+MOTION = "position and velocity"
+FORCE = "velocity and accelerometer"
+TILT = "velocity and tilt"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two sides of one motion, (M, k) each, in the same unit.
+
+    They last `seconds`, in windows of `window` s. Below an RMS of `weak` they tell nothing (where one side alone moves:
+    below three times that).
+    """
+
+    name: str
+    one: np.ndarray
+    other: np.ndarray
+    seconds: float
+    window: float
+    weak: float
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is motion enough to compare."""
+        if self.seconds < ENOUGH or not len(self.one):
+            return False
+        one, other = _rms(self.one), _rms(self.other)
+        return min(one, other) > self.weak or max(one, other) > 3.0 * self.weak
+
+    @property
+    def left(self) -> float:
+        """Share of the motion's energy by which the two differ; 0 where they agree, 2 where they are strangers."""
+        energy = 0.5 * (np.sum(self.one**2) + np.sum(self.other**2))
+        return float(np.sum((self.one - self.other) ** 2) / max(energy, 1e-12))
+
+    def likelihood(self, left: float) -> float:
+        """Log likelihood that is gained where only the share `left` stays, every window counted once."""
+        count = self.one.shape[1] * self.seconds / self.window
+        return float(0.5 * count * np.log(max(self.left, 1e-6) / max(left, 1e-6)))
+
+
+class Windows:
+    """The windows of one flight: clock `t` (N,), even within its stretches, and `flying` (N,).
+
+    `rates` are the true rates in Hz of columns that were held: windows span three of their values at least.
+    """
+
+    def __init__(self, t: np.ndarray, flying: np.ndarray, rates: Mapping[str, float] | None = None) -> None:
+        self.t, self.flying = t, flying
+        self.dt = float(np.median(np.diff(t)))
+        turning = [
+            3.0 / rate for name, rate in (rates or {}).items() if name in ("quaternion", "angular_velocity")
+        ]
+        moving = [3.0 / rate for rate in (rates or {}).values()]
+        self.turn = max(1, round(max(TURN, *turning, 0.0) / self.dt))
+        self.move = max(1, round(max(MOVE, *moving, 0.0) / self.dt))
+        self._turned: tuple[tuple[int, int], np.ndarray] = ((0, 0), np.empty(0))
+
+    def rows(self, width: int, reach: int = 0) -> np.ndarray:
+        """First rows of windows of `width` samples in the air, with `reach` more on either side, a quarter apart."""
+        starts = [np.arange(s.start + reach, s.stop - width - reach) for s in segments(self.t)]
+        rows = np.concatenate([*starts, np.array([], dtype=int)])
+        ground = np.concatenate([[0], np.cumsum(~self.flying)])
+        rows = rows[ground[rows + width + 1] == ground[rows]]
+        return rows[:: max(1, width // 4)]
+
+    def pairs(self, columns: Columns, shift: int = 0, reach: int = 0) -> list[Pair]:
+        """The pairs that the columns allow.
+
+        Attitude and trajectory are read `shift` samples (at most `reach`) later than the gyroscope and accelerometer.
+        """
+        found = []
+        q, w = columns.get("quaternion"), columns.get("angular_velocity")
+        p, v = columns.get("position"), columns.get("velocity")
+        if q is not None and w is not None:
+            rows = self.rows(self.turn, reach)
+            turned = body_rate(q[rows + shift], q[rows + self.turn + shift], self.turn * self.dt)
+            found.append(self._pair(ROTATION, turned, self.mean(w, rows, self.turn), rows, self.turn, TURNS))
+        rows = self.rows(self.move, reach)
+        if p is not None and v is not None:
+            moved = (p[rows + self.move + shift] - p[rows + shift]) / (self.move * self.dt)
+            found.append(self._pair(MOTION, moved, self.mean(v, rows, self.move), rows, self.move, MOVES))
+        if v is None and p is not None:
+            v = slopes(self.t, p)
+        if v is not None and q is not None:
+            gained = (v[rows + self.move + shift] - v[rows + shift]) / (self.move * self.dt)
+            found.append(self._accelerations(gained, q, columns.get("specific_force"), rows))
+        return found
+
+    def mended(self, columns: Columns, pairs: list[Pair], fault: Fault) -> list[Pair]:
+        """`pairs` of these columns as they would be without the `fault`; quick where vectors stand in other axes."""
+        if fault.axes is None or any(p.name == TILT for p in pairs):
+            return self.pairs(fault.mend(columns))
+        path = "velocity" if "velocity" in columns else "position"
+        out = []
+        for pair in pairs:
+            one, other = pair.one, pair.other
+            first, second = {
+                ROTATION: ("", "angular_velocity"),
+                MOTION: ("position", "velocity"),
+                FORCE: (path, ""),
+            }[pair.name]
+            if first in fault.names:
+                one = one @ fault.axes.T
+            if second in fault.names:
+                other = other @ fault.axes.T
+            if pair.name == FORCE and "specific_force" in fault.names:
+                other = self._felt(np.einsum("mijk,jk->mi", self._turned_force(columns), fault.axes))
+            out.append(replace(pair, one=one, other=other))
+        return out
+
+    def _turned_force(self, columns: Columns) -> np.ndarray:
+        """Mean over each window of each element of the rotation times each axis of the accelerometer, (M, 3, 3, 3)."""
+        key = (id(columns["quaternion"]), id(columns["specific_force"]))
+        if self._turned[0] != key:
+            q, f = columns["quaternion"], columns["specific_force"]
+            axes = np.stack([rotate(q, np.tile(axis, (len(q), 1))) for axis in np.eye(3)], -1)
+            every = (axes[:, :, :, None] * f[:, None, None, :]).reshape(len(q), 27)
+            rows = self.rows(self.move)
+            self._turned = (key, self.mean(every, rows, self.move).reshape(len(rows), 3, 3, 3))
+        return self._turned[1]
+
+    def _felt(self, force: np.ndarray) -> np.ndarray:
+        """The acceleration (M, 3) that a specific force in the world tells, without its horizontal mean."""
+        felt = force - [0.0, 0.0, GRAVITY]
+        return np.asarray(felt - (np.where([True, True, False], felt.mean(0), 0.0) if len(felt) else 0.0))
+
+    def _accelerations(
+        self, gained: np.ndarray, q: np.ndarray, force: np.ndarray | None, rows: np.ndarray
+    ) -> Pair:
+        """What the velocity gains, and what accelerometer or tilt say; without their horizontal means, for a bias and a
+        steady wind are no disagreement."""
+        if force is not None:
+            felt, name = self._felt(self.mean(rotate(q, force), rows, self.move)), FORCE
+        else:
+            up = rotate(q, np.tile([0.0, 0.0, 1.0], (len(q), 1)))
+            lean = up[:, :2] / np.where(np.abs(up[:, 2:]) < 0.1, 0.1, up[:, 2:])
+            felt = self.mean(lean, rows, self.move) * (gained[:, 2:] + GRAVITY)
+            felt, gained = felt - (felt.mean(0) if len(rows) else 0.0), gained[:, :2]
+            name = TILT
+        gained = gained - (gained.mean(0) if len(rows) else 0.0)
+        return self._pair(name, gained, felt, rows, self.move, GAINS)
+
+    def _pair(
+        self, name: str, one: np.ndarray, other: np.ndarray, rows: np.ndarray, width: int, weak: float
+    ) -> Pair:
+        seconds = len(rows) * max(1, width // 4) * self.dt
+        return Pair(name, one, other, seconds, width * self.dt, weak)
+
+    def mean(self, column: np.ndarray, rows: np.ndarray, width: int) -> np.ndarray:
+        """Mean of a column (N, k) over windows, (M, k), by trapezes."""
+        halves = 0.5 * (column[1:] + column[:-1])
+        total = np.concatenate([np.zeros((1, column.shape[1])), np.cumsum(halves, axis=0)])
+        return np.asarray((total[rows + width] - total[rows]) / width)
+
+    def earlier(self, column: np.ndarray, late: float, unit_quaternion: bool = False) -> np.ndarray:
+        """A column (N, k) as it would be without a delay of `late` s, within each stretch of the clock."""
+        out = column.copy()
+        source = continuous_quaternion(column) if unit_quaternion else column
+        for part in segments(self.t):
+            clock = self.t[part]
+            out[part] = np.stack([np.interp(clock + late, clock, axis) for axis in source[part].T], -1)
+        return out / np.linalg.norm(out, axis=1, keepdims=True) if unit_quaternion else out
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(values**2, axis=1)))) if len(values) else 0.0
