@@ -70,40 +70,45 @@ def reconcile(t: np.ndarray, columns: Columns, flying: np.ndarray) -> Reconciled
     `t` (N,) in s, even within its stretches; `columns` (N, k) by the names of `models.flight.COLUMNS`; `flying` (N,).
     """
     columns, rates, notes = unheld(t, columns, flying)
-    windows = Windows(t, flying, rates)
-    columns, late = _undelayed(windows, columns, [p for p in windows.pairs(columns) if p.moves])
+    # what jumps must not look like a delay, and what is late must not look like jumps
+    steady = flying & _kept(t, steps(t, columns, flying), flying)
+    columns, late = _undelayed(Windows(t, steady, rates), columns)
     found = steps(t, columns, flying)
     heading = [s for s in found if s.what == "heading" and not s.glitch]
     if 0 < len(heading) <= MOST_JUMPS:
-        columns, said = _without_heading_jumps(windows, columns, heading)
+        columns, said = _without_heading_jumps(Windows(t, flying, rates), columns, heading)
         notes += said
         found = [s for s in steps(t, columns, flying) if s.what != "heading"] + heading
     velocity = [s for s in found if s.what == "velocity"]
     found = [s for s in found if s in velocity or not any(v.overlaps(s) for v in velocity)]
-    keep = without(t, found)
-    if np.sum(~keep & flying) > MOST_CUT * np.sum(flying):
-        keep, found = np.ones(len(t), dtype=bool), []
-    notes += told(t, found)
+    keep = _kept(t, found, flying)
+    if not np.all(keep):
+        notes += told(t, found)
     columns = {name: column[keep] for name, column in columns.items()}
-    columns, checks = _examined(Windows(t[keep], flying[keep], rates), columns, late)
+    checks = _examined(Windows(t[keep], flying[keep], rates), columns, late)
     notes += [c.text for c in checks if c.verdict in ("undone", "weak")]
     return Reconciled(keep, columns, checks, rates, tuple(notes))
 
 
-def _examined(windows: Windows, columns: Columns, late: list[Check]) -> tuple[Columns, tuple[Check, ...]]:
-    """The columns with delays undone, and a check for every pair that they allow; `late` were undone before."""
+def _kept(t: np.ndarray, found: list[Step], flying: np.ndarray) -> np.ndarray:
+    """Rows (N,) to keep; all of them where what looks like steps is disagreement throughout."""
+    keep = without(t, found)
+    throughout = np.sum(~keep & flying) > MOST_CUT * np.sum(flying)
+    return np.ones(len(t), dtype=bool) if throughout else keep
+
+
+def _examined(windows: Windows, columns: Columns, late: list[Check]) -> tuple[Check, ...]:
+    """A check for every pair that the columns allow; `late` tells what was undone before."""
     pairs = windows.pairs(columns)
     moving = [p for p in pairs if p.moves]
     too_little = "the flight moves too little to compare them"
     still = [Check(p.name, "cannot tell", float("nan"), too_little) for p in pairs if not p.moves]
     fault = _likeliest(windows, columns, moving)
     if fault is not None or any(p.left > DISAGREE for p in moving):
-        return columns, (*_disagreements(windows, columns, moving, fault), *still)
-    columns, later = _undelayed(windows, columns, moving)
-    moving = [p for p in windows.pairs(columns) if p.moves]
-    found = {c.pair: c for c in (*late, *later, *_small_turns(columns, moving))}
+        return (*_disagreements(windows, columns, moving, fault), *still)
+    found = {c.pair: c for c in (*late, *_small_turns(columns, moving))}
     agreeing = [Check(p.name, "agrees", p.left) for p in moving if p.name not in found]
-    return columns, (*found.values(), *agreeing, *still)
+    return (*found.values(), *agreeing, *still)
 
 
 def refusal(checks: tuple[Check, ...]) -> str:
@@ -201,10 +206,10 @@ def _sensor_angle(windows: Windows, columns: Columns, name: str) -> float:
     return turn_between(rotate(inverse, gained), windows.mean(columns[name], rows, windows.move))
 
 
-def _undelayed(windows: Windows, columns: Columns, moving: list[Pair]) -> tuple[Columns, list[Check]]:
+def _undelayed(windows: Windows, columns: Columns) -> tuple[Columns, list[Check]]:
     """The columns without the delay of attitude, then of position and velocity, against the IMU, where it is sure."""
     out, checks = dict(columns), []
-    names = {p.name for p in moving}
+    names = {p.name for p in windows.pairs(columns) if p.moves}
     for name, shifted in ((ROTATION, ("quaternion",)), (FORCE, _trajectory(columns))):
         late, left = _delay(windows, out, name) if name in names else (0.0, 0.0)
         if abs(late) < TOLD_LATE:
@@ -266,8 +271,8 @@ def _without_heading_jumps(
     trajectory; a jump that neither mends stays."""
     t, notes = windows.t, []
 
-    def left(some: Columns) -> float:
-        return next((p.left for p in windows.pairs(some) if p.name in (FORCE, TILT) and p.moves), np.inf)
+    def path(some: Columns) -> Pair | None:
+        return next((p for p in windows.pairs(some) if p.name in (FORCE, TILT) and p.moves), None)
 
     for jump in jumps:
         q, earlier = columns["quaternion"], (np.arange(len(t)) < jump.last)[:, None]
@@ -275,10 +280,13 @@ def _without_heading_jumps(
             "before": np.where(earlier, turned_about_z(q, jump.size), q),
             "after": np.where(earlier, q, turned_about_z(q, -jump.size)),
         }
-        side = min(ways, key=lambda way: left({**columns, "quaternion": ways[way]}))
-        mended = {**columns, "quaternion": ways[side]}
-        if left(mended) < BETTER * left(columns):
-            columns = mended
+        now = path(columns)
+        left = {way: p.left for way in ways if (p := path({**columns, "quaternion": ways[way]})) is not None}
+        if now is None or not left:
+            continue
+        side = min(left, key=lambda way: left[way])
+        if left[side] < now.left and now.likelihood(left[side]) > SURE:
+            columns = {**columns, "quaternion": ways[side]}
             notes.append(
                 f"the heading {side} its jump at t = {t[jump.first]:.2f} s was turned by "
                 f"{np.degrees(abs(jump.size)):.0f} degrees: velocity and accelerometer agree then"

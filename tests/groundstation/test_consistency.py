@@ -79,9 +79,9 @@ def test_of_48_ways_to_exchange_axes_none_passes(flight: Flight, columns: str, i
 def _unseen(names: list[str], axes: np.ndarray, imu: bool) -> bool:
     """Without an accelerometer nothing tells the sign of the height; with no drag an accelerometer feels nothing
     sideways, so that nothing tells its signs there."""
-    mirrored = np.array_equal(np.abs(axes), np.eye(3))
     if names == ["specific_force"]:
-        return mirrored and axes[2, 2] == 1.0
+        return bool(axes[2, 2] == 1.0)
+    mirrored = np.array_equal(np.abs(axes), np.eye(3))
     return not imu and mirrored and axes[0, 0] == axes[1, 1] == 1.0
 
 
