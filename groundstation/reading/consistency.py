@@ -140,7 +140,9 @@ def _disagreements(
                 f"{pair.name} differ by {100 * min(pair.left, 9.99):.0f} % of the motion's energy, and no exchange of "
                 "axes, frames or units that is known mends it"
             )
-            yield Check(pair.name, "contradicts" if pair.left > CONTRADICT else "weak", pair.left, text)
+            # an estimator may correct its position past its velocity for minutes (GPS): nothing is refused for that
+            refused = pair.left > CONTRADICT and pair.name != MOTION
+            yield Check(pair.name, "contradicts" if refused else "weak", pair.left, text)
 
 
 def _likeliest(windows: Windows, columns: Columns, moving: list[Pair]) -> Fault | None:

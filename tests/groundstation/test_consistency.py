@@ -206,6 +206,16 @@ def test_columns_of_two_vehicles_are_refused(flight: Flight) -> None:
     assert "two vehicles" in refusal(reconcile(flight.t[:count], mixed, flight.flying[:count]).checks)
 
 
+def test_a_position_that_wanders_by_gps_is_told_and_not_refused(flight: Flight) -> None:
+    """PX4 by GPS in a slow flight: corrections move the position by more than the vehicle moves."""
+    good = columns_of(flight)
+    wander = np.cumsum(np.random.default_rng(2).standard_normal((len(flight), 3)), axis=0) * 0.2
+    seen = looked_at(flight, {**good, "position": good["position"] + wander})
+    assert not refusal(seen.checks)
+    (check,) = [c for c in seen.checks if c.verdict == "weak"]
+    assert check.pair == "position and velocity" and any(check.text in note for note in seen.notes)
+
+
 def test_a_hover_says_that_it_cannot_tell(flight: Flight) -> None:
     generator = np.random.default_rng(1)
     still = {n: 0.0 * c + 1e-3 * generator.standard_normal(c.shape) for n, c in columns_of(flight).items()}
