@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from trueflight.groundstation.reading import plausible, rows
+from trueflight.groundstation.reading.actuation import actuation_checks
 from trueflight.groundstation.reading.airborne import flying_mask
 from trueflight.groundstation.reading.consistency import reconcile, refusal
 from trueflight.groundstation.reading.uniform import MOST_LOST, even_clock, slopes
@@ -64,7 +65,8 @@ def assemble(
         given["velocity"] = slopes(t, given["position"])
         said.append("no velocity in the log: differentiated from the position")
     agreed = reconcile(t, given, in_air)
-    if wrong := refusal(agreed.checks):
+    checks = (*agreed.checks, *actuation_checks(t[agreed.keep], agreed.columns, in_air[agreed.keep], vehicle))
+    if wrong := refusal(checks):
         raise InputError(f"{origin}: {wrong}")
     extras = {n.removeprefix("extra "): column for n, column in every.items() if n.startswith("extra ")}
     return Flight(
@@ -77,9 +79,9 @@ def assemble(
         sensor_rate=agreed.rates.get("specific_force" if "specific_force" in given else "velocity"),
         origin=origin,
         data_hash=hashlib.sha256(path.read_bytes()).hexdigest(),
-        notes=(*said, *agreed.notes),
+        notes=(*said, *agreed.notes, *(c.text for c in checks[len(agreed.checks) :] if c.verdict == "weak")),
         extra={name: column[agreed.keep] for name, column in extras.items()},
-        consistency=agreed.checks,
+        consistency=checks,
     )
 
 

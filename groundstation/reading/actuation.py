@@ -1,0 +1,232 @@
+"""Do commands and vehicle agree? Thrust lifts, motors follow the thrust, rotors their motors, and motors turn it.
+
+How much they do is what a diagnosis finds out; here only sign and order are looked at, by the correlation of what
+changes within seconds: a battery that empties, a payload or a thrust curve leave it as it is.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from trueflight.groundstation.reading.faults import Columns
+from trueflight.groundstation.reading.uniform import segments, slopes
+from trueflight.models.flight import Check
+from trueflight.models.frames import rotate
+from trueflight.models.vehicle import GRAVITY, Vehicle
+
+LIFT = "thrust and vertical acceleration"
+MOTORS = "motor commands and thrust"
+ROTORS = "rotor speeds and motor commands"
+TORQUE = "motor commands and rotation"
+
+AGAINST, LITTLE = -0.7, 0.3
+"""Correlation below which two columns move against each other, and below which one does not follow the other."""
+FOLLOWS = 0.6
+"""Correlation from which on another order of the columns is believed, where theirs has less than half of it."""
+FAST, SLOW = 0.1, 4.0
+"""s over which columns are smoothed, and over which a mean is taken away."""
+DIFFERENTIATED = 0.5
+"""s over which an acceleration is smoothed that was differentiated from the velocity."""
+LIFTS, TURNS = 0.3, 1.0
+"""m/s² and rad/s² from which on changes of the acceleration are motion, not vibration."""
+STEERED = 0.003
+"""Of full throttle; smaller changes of a motor tell nothing: some logs hold 8 bits."""
+COVERED = 0.5
+"""Share of what is felt below which the thrust's changes are covered by noise, gusts and manoeuvres."""
+LATEST = 0.15
+"""s; motors, rate loop and filters delay what a command brings by no more."""
+ENOUGH = 5.0
+"""s in the air without which nothing is said."""
+
+
+def actuation_checks(
+    t: np.ndarray, columns: Columns, flying: np.ndarray, vehicle: Vehicle
+) -> tuple[Check, ...]:
+    """Checks of commands and rotors of a flight on the even clock `t` (N,); `columns` (N, ...) by attribute of
+    `Flight`, `flying` (N,)."""
+    if np.sum(flying) * float(np.median(np.diff(t))) < ENOUGH:
+        return ()
+    changes = _Changes(t, flying)
+    return tuple(
+        check for part in (_lift, _motors, _rotors, _torque) for check in part(changes, columns, vehicle)
+    )
+
+
+class _Changes:
+    """Changes of columns over `FAST` to `SLOW` seconds, at the rows in the air."""
+
+    def __init__(self, t: np.ndarray, flying: np.ndarray) -> None:
+        self.t, self.flying = t, flying
+        self.dt = float(np.median(np.diff(t)))
+
+    def of(self, column: np.ndarray, late: float = 0.0, fast: float = FAST, slow: float = SLOW) -> np.ndarray:
+        """The changes of a column (N,) or (N, k), read `late` s later, at the rows in the air."""
+        shift, width = round(late / self.dt), max(1, round(fast / self.dt))
+        out = np.full(column.shape, np.nan)
+        for part in segments(self.t):
+            some = column[part]
+            if len(some) > 2 * shift + width:
+                smooth = uniform_filter1d(some, width, axis=0)
+                change = smooth - uniform_filter1d(some, max(width, round(slow / self.dt)), axis=0)
+                out[part.start : part.stop - shift] = change[shift:]
+        return out[self.flying]
+
+    def lags(self) -> np.ndarray:
+        """Delays to be tried, s."""
+        return np.arange(0.0, LATEST + 1e-9, max(0.02, self.dt))
+
+
+def _correlation(one: np.ndarray, other: np.ndarray) -> float:
+    """Pearson's correlation of two (M,) over the rows that both have; 0 where one does not change."""
+    both = np.isfinite(one) & np.isfinite(other)
+    a, b = one[both], other[both]
+    if len(a) < 10 or np.std(a) < 1e-12 or np.std(b) < 1e-12:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _strongest(correlations: list[float]) -> float:
+    return max(correlations, key=abs)
+
+
+def _lift(changes: _Changes, columns: Columns, vehicle: Vehicle) -> Iterator[Check]:
+    """Thrust against what the accelerometer feels along body z, or against climb and tilt."""
+    if "thrust_command" not in columns:
+        return
+    force, mirrored = (_felt_along_z(changes.t, columns, sign) for sign in (1.0, -1.0))
+    if force is None or mirrored is None:
+        return
+    fast = FAST if "specific_force" in columns else DIFFERENTIATED
+    thrust = changes.of(columns["thrust_command"], fast=fast) * GRAVITY / max(vehicle.hover_thrust, 1e-3)
+    felt = [changes.of(force, late, fast) for late in changes.lags()]
+    if min(np.nanstd(thrust), np.nanstd(felt[0])) < LIFTS or np.nanstd(thrust) < COVERED * np.nanstd(felt[0]):
+        yield Check(LIFT, "cannot tell", float("nan"), "the thrust changes too little to compare them")
+        return
+    follows = max(_correlation(thrust, late) for late in felt)
+    turned = max(_correlation(thrust, changes.of(mirrored, late, fast)) for late in changes.lags())
+    what = "the accelerometer's z" if "specific_force" in columns else "the climb"
+    left = 1.0 - follows if follows < 0 else 1.0 - follows**2
+    if turned > FOLLOWS and follows < 0.5 * turned:
+        names = ("specific_force",) if "specific_force" in columns else ("position", "velocity")
+        mapping = "\n".join(f'[{n}] axes = ["x", "y", "-z"]' for n in names if n in columns)
+        text = f"{what} falls where the thrust rises: z or the thrust has the wrong sign"
+        yield Check(LIFT, "contradicts", left, text, mapping)
+    elif follows < LITTLE:
+        text = f"{what} hardly follows the thrust command (correlation {follows:.2f}): what is said of thrust is weak"
+        yield Check(LIFT, "weak", left, text)
+    else:
+        yield Check(LIFT, "agrees", left)
+
+
+def _felt_along_z(t: np.ndarray, columns: Columns, sign: float) -> np.ndarray | None:
+    """Specific force along body z (N,), measured, or what climb and tilt tell of it, if z of the columns points up
+    (`sign` 1) or down (-1); None where neither is known."""
+    if (force := columns.get("specific_force")) is not None:
+        return np.asarray(sign * force[:, 2])
+    v, q = columns.get("velocity"), columns.get("quaternion")
+    if v is None or q is None:
+        return None
+    up = rotate(q, np.tile([0.0, 0.0, 1.0], (len(q), 1)))[:, 2]
+    return np.asarray((sign * slopes(t, v)[:, 2] + GRAVITY) / np.maximum(up, 0.1))
+
+
+def _motors(changes: _Changes, columns: Columns, _vehicle: Vehicle) -> Iterator[Check]:
+    """The mean of the motors against the collective."""
+    motors, thrust = columns.get("motor_command"), columns.get("thrust_command")
+    if motors is None or thrust is None or np.array_equal(thrust, motors.mean(axis=1)):
+        return
+    mean, collective = changes.of(motors.mean(axis=1)), changes.of(thrust)
+    if min(np.nanstd(mean), np.nanstd(collective)) < STEERED:
+        yield Check(MOTORS, "cannot tell", float("nan"), "the thrust changes too little to compare them")
+        return
+    follows = _strongest(
+        [_correlation(collective, changes.of(motors.mean(axis=1), s)) for s in changes.lags()]
+    )
+    if follows < LITTLE:
+        text = (
+            f"the motors do not follow the thrust command (correlation {follows:.2f}): two vehicles' columns?"
+        )
+        yield Check(MOTORS, "contradicts" if follows < AGAINST else "weak", 1.0 - follows, text)
+    else:
+        yield Check(MOTORS, "agrees", 1.0 - follows**2)
+
+
+def _rotors(changes: _Changes, columns: Columns, _vehicle: Vehicle) -> Iterator[Check]:
+    """Each rotor against its motor, without what all have in common."""
+    motors, speeds = columns.get("motor_command"), columns.get("rotor_speed")
+    if motors is None or speeds is None or motors.shape != speeds.shape:
+        return
+    commanded = changes.of(motors - motors.mean(axis=1, keepdims=True))
+    moving = np.nanstd(commanded, axis=0)
+    if np.min(moving) < STEERED:
+        yield Check(ROTORS, "cannot tell", float("nan"), "the motors differ too little to compare them")
+        return
+    apart = speeds - speeds.mean(axis=1, keepdims=True)
+    at = [changes.of(apart, late) for late in changes.lags()]
+    count = motors.shape[1]
+    table = np.array(
+        [
+            [max(_correlation(commanded[:, m], spun[:, r]) for spun in at) for r in range(count)]
+            for m in range(count)
+        ]
+    )
+    yield _ordered(ROTORS, table, "rotor_speed", "motor command")
+
+
+def _ordered(name: str, table: np.ndarray, what: str, whose: str) -> Check:
+    """Which order fits a table of correlations (k, k) of what is commanded (rows) with what follows (columns)."""
+    from scipy.optimize import linear_sum_assignment
+
+    rows, order = linear_sum_assignment(-table)
+    own, best = float(np.mean(np.diag(table))), float(np.mean(table[rows, order]))
+    left = 1.0 - own if own < 0 else 1.0 - own**2
+    if best > FOLLOWS and own < 0.5 * best:
+        listed = ", ".join(f"{what}_{k + 1}" for k in order)
+        return Check(
+            name, "contradicts", left, f"{whose}s 1, 2, ... are followed by {listed}: the order differs"
+        )
+    if own < LITTLE:
+        return Check(name, "weak", left, f"{what} does not follow the {whose}s (correlation {own:.2f})")
+    return Check(name, "agrees", left)
+
+
+def _torque(changes: _Changes, columns: Columns, vehicle: Vehicle) -> Iterator[Check]:
+    """The motors' differences about body x and y against the angular acceleration, by the rotors' places."""
+    motors, rate = columns.get("motor_command"), columns.get("angular_velocity")
+    places = np.array(vehicle.rotor_positions, dtype=float)
+    if motors is None or rate is None or len(places) != motors.shape[1] or len(places) > 4:
+        return
+    arms = np.stack([places[:, 1], -places[:, 0]], axis=1)  # of a force along z: torque about x, y
+    turning = slopes(changes.t, rate[:, :2])
+    commanded = changes.of(motors, slow=1.0) @ arms
+    still = np.min(np.nanstd(commanded, axis=0)) < STEERED * np.max(np.abs(arms))
+    if still or np.min(np.nanstd(changes.of(turning, slow=1.0), axis=0)) < TURNS:
+        yield Check(TORQUE, "cannot tell", float("nan"), "the vehicle turns too little to compare them")
+        return
+    at = [changes.of(turning, late, slow=1.0) for late in changes.lags()]
+
+    def follows(order: tuple[int, ...]) -> float:
+        wanted = (
+            commanded if order == tuple(range(len(places))) else changes.of(motors[:, order], slow=1.0) @ arms
+        )
+        return min(max(_correlation(wanted[:, k], turned[:, k]) for turned in at) for k in range(2))
+
+    own = follows(tuple(range(len(places))))
+    left = 1.0 - own if own < 0 else 1.0 - own**2
+    best, order = max((follows(order), order) for order in itertools.permutations(range(len(places))))
+    if best > FOLLOWS and own < 0.5 * best:
+        listed = ", ".join(f"motor_command_{k + 1}" for k in order)
+        text = (
+            f"the vehicle turns as if its rotors 1, 2, ... were {listed}: motors and rotor_positions of the vehicle "
+            "file are numbered differently"
+        )
+        yield Check(TORQUE, "contradicts", left, text)
+    elif own < LITTLE:
+        text = f"the vehicle does not turn as motors and rotor_positions say (correlation {own:.2f})"
+        yield Check(TORQUE, "weak", left, text)
+    else:
+        yield Check(TORQUE, "agrees", left)
