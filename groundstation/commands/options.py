@@ -15,7 +15,10 @@ FlightArgument = Annotated[
 VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
 ]
-MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML that maps the file's columns.")]
+MappingOption = Annotated[
+    list[str] | None,
+    typer.Option("--mapping", help="TOML file that maps columns, or a line of one: 'velocity.turned = 20'."),
+]
 ValidateOption = Annotated[
     Path | None, typer.Option("--validate", help="Another flight, held out of every fit.")
 ]

@@ -23,6 +23,7 @@ from trueflight.groundstation.commands.options import (
     VehicleOption,
 )
 from trueflight.groundstation.output.terminal import print_written
+from trueflight.groundstation.reading.mapping import Given
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
 
@@ -178,7 +179,7 @@ def ablate_command(
 # --- what goes in ---------------------------------------------------------------------------------------------------
 
 
-def _read_flights(paths: list[Path], vehicle: Path | None, mapping: Path | None, quiet: bool) -> list[Flight]:
+def _read_flights(paths: list[Path], vehicle: Path | None, mapping: Given, quiet: bool) -> list[Flight]:
     from trueflight.groundstation.reading.several import flights_in, read_flights
 
     files = flights_in(paths)

@@ -19,6 +19,7 @@ import numpy as np
 from scipy import stats
 
 from trueflight.groundstation.reading.flight_file import ENDINGS
+from trueflight.groundstation.reading.mapping import Given, absolute
 from trueflight.groundstation.reading.several import flight_files
 from trueflight.models.errors import InputError
 from trueflight.models.outside import is_number
@@ -123,7 +124,10 @@ def survey_files(folder: Path) -> list[Path]:
 SAVED_TABLE = "survey.parquet"
 
 
-def survey_flight(file: str, vehicle: str | None, mapping: str | None, effects: str | None) -> Row:
+_Task = tuple[str | None, list[str], str | None]
+
+
+def survey_flight(file: str, vehicle: str | None, mapping: list[str], effects: str | None) -> Row:
     """Diagnose one file from the linear model with exact rotation; whatever goes wrong is told in the row."""
     from trueflight.groundstation.identify.translation import diagnose
     from trueflight.groundstation.reading import read_flight
@@ -190,7 +194,7 @@ def _day(path: Path) -> str:
 def survey(
     files: Sequence[Path],
     vehicle: Path | None = None,
-    mapping: Path | None = None,
+    mapping: Given = None,
     effects: Path | None = None,
     jobs: int = 0,
     memory: str = "auto",
@@ -202,7 +206,8 @@ def survey(
     With `jobs` 1 here; otherwise in so many processes of Dask (0: one a core), each held to `memory`, or by the workers
     of the cluster at `scheduler`, which must see the files under the same paths. `ready` is told where one can watch.
     """
-    task = [None if p is None else str(p.resolve()) for p in (vehicle, mapping, effects)]
+    believed, own = (None if p is None else str(p.resolve()) for p in (vehicle, effects))
+    task: _Task = (believed, absolute(mapping), own)
     names = [str(f.resolve()) for f in files]
     if scheduler is None and (jobs == 1 or len(files) == 1):
         for name in names:
@@ -213,7 +218,7 @@ def survey(
 
 def _by_dask(
     names: list[str],
-    task: list[str | None],
+    task: _Task,
     jobs: int,
     memory: str,
     scheduler: str | None,
@@ -264,7 +269,7 @@ def _workers(jobs: int, memory: str, scheduler: str | None) -> Iterator[Client]:
             cluster.close()
 
 
-def _surveyed(client: Client, names: list[str], task: list[str | None]) -> Iterator[Row]:
+def _surveyed(client: Client, names: list[str], task: _Task) -> Iterator[Row]:
     """Each flight as it is done; a worker that dies takes along what waited for it: who kills one alone is told, the
     others are not."""
     from distributed import as_completed, wait

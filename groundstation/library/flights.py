@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from trueflight.groundstation.library.shown import Summary, answering, data_frame, summary_of
+from trueflight.groundstation.reading.mapping import Given
 from trueflight.models import flight as columns
 from trueflight.models.vehicle import Vehicle
 
@@ -83,9 +84,7 @@ class Flight(columns.Flight):
             console.print(f"note: {plain(note)}", highlight=False)
 
 
-def read(
-    path: str | Path, vehicle: str | Path | Vehicle | None = None, mapping: str | Path | None = None
-) -> Flight:
+def read(path: str | Path, vehicle: str | Path | Vehicle | None = None, mapping: Given = None) -> Flight:
     """Read the flight at `path`, of any kind: PX4 ULog, MCAP of the companion or of ROS 2, CSV or Parquet.
 
     `vehicle` is the vehicle as you believe it to be, or its vehicle.toml; None takes the file beside the flight, or
@@ -103,7 +102,7 @@ def read(
 def read_all(
     paths: str | Path | Sequence[str | Path],
     vehicle: str | Path | Vehicle | None = None,
-    mapping: str | Path | None = None,
+    mapping: Given = None,
 ) -> list[Flight]:
     """Read several flights: of `paths` the files, and every flight of folders, in the order of their names.
 

@@ -112,7 +112,7 @@ def _lift(changes: _Changes, columns: Columns, vehicle: Vehicle) -> Iterator[Che
     left = 1.0 - follows if follows < 0 else 1.0 - follows**2
     if turned > FOLLOWS and follows < 0.5 * turned:
         names = ("specific_force",) if "specific_force" in columns else ("position", "velocity")
-        mapping = "\n".join(f'[{n}] axes = ["x", "y", "-z"]' for n in names if n in columns)
+        mapping = "\n".join(f'{n}.axes = ["x", "y", "-z"]' for n in names if n in columns)
         text = f"{what} falls where the thrust rises: z or the thrust has the wrong sign"
         yield Check(LIFT, "contradicts", left, text, mapping)
     elif follows < LITTLE:

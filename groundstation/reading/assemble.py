@@ -12,6 +12,7 @@ from trueflight.groundstation.reading import plausible, rows
 from trueflight.groundstation.reading.actuation import actuation_checks
 from trueflight.groundstation.reading.airborne import flying_mask
 from trueflight.groundstation.reading.consistency import reconcile, refusal
+from trueflight.groundstation.reading.mapping import Mapping, corrected, corrected_time
 from trueflight.groundstation.reading.uniform import MOST_LOST, even_clock, slopes
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -30,10 +31,11 @@ def assemble(
     commanded: np.ndarray | None = None,
     notes: tuple[str, ...] = (),
     most_lost: float = MOST_LOST,
+    mapping: Mapping | None = None,
 ) -> Flight:
     """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
     find what was flown. `place(row)` names a row in messages; `most_lost` is the share of samples that gaps may
-    take. Raises `InputError` for anything that cannot be analysed."""
+    take; `mapping` corrects the columns. Raises `InputError` for anything that cannot be analysed."""
     origin = str(path)
     _check_groups(origin, columns)
     columns, dead = rows.without_dead_battery(columns)
@@ -46,7 +48,12 @@ def assemble(
         every["flying"] = np.asarray(flying, dtype=bool)
     if commanded is not None:
         every["commanded"] = np.asarray(commanded, dtype=bool)
+    if mapping is not None:
+        t = corrected_time(mapping, t, vehicle)
     t, every, mended = _whole_rows(t, every, names, place)
+    if mapping is not None:
+        every |= corrected(mapping, t, {name: every[name] for name in names if name in every}, vehicle)
+        mended.append(f"corrected by {mapping.source}")
     plausible.check_units({name: every[name] for name in names}, vehicle, origin)
     every, wrong_voltage = plausible.without_wrong_voltage(every, vehicle)
     t, every, resampled = even_clock(t, rows.continuous(every), origin, most_lost)
@@ -60,13 +67,14 @@ def assemble(
         in_air = in_air & every["commanded"]
     said += _left_out(t, in_air, said, origin)
     plausible.check_sensors(t, given, in_air, origin)
-    plausible.check_specific_force(given, in_air, origin)
+    implausible = plausible.implausible_force(given, in_air)
     if "position" in given and "velocity" not in given:
         given["velocity"] = slopes(t, given["position"])
         said.append("no velocity in the log: differentiated from the position")
     agreed = reconcile(t, given, in_air)
     checks = (*agreed.checks, *actuation_checks(t[agreed.keep], agreed.columns, in_air[agreed.keep], vehicle))
-    if wrong := refusal(checks):
+    named = any(c.mapping and c.verdict == "contradicts" for c in checks)
+    if wrong := implausible if implausible and not named else refusal(checks):
         raise InputError(f"{origin}: {wrong}")
     extras = {n.removeprefix("extra "): column for n, column in every.items() if n.startswith("extra ")}
     return Flight(

@@ -39,6 +39,8 @@ MENDED, BETTER = 0.35, 0.25
 """A fault explains what two columns differ by if it leaves less than `MENDED` of the motion, and `BETTER` of that."""
 SURE = 10.0
 """Log likelihood from which on a fault is believed."""
+ALIKE = 0.5
+"""Units of log of what is left by which faults must differ to be told apart."""
 CLEAN = 0.02
 """Share left below which only mirrored axes are still looked for: one with little motion hides behind the others."""
 REFUSED_ANGLE = np.radians(15.0)
@@ -118,11 +120,16 @@ def refusal(checks: tuple[Check, ...]) -> str:
         return ""
     worst = max(wrong, key=lambda c: c.left)
     advice = (
-        f"correct it, or map it (--mapping): {'; '.join(worst.mapping.splitlines())}"
+        f"correct it, or read it with {' '.join(as_options(worst.mapping))}"
         if worst.mapping
         else "compare the columns: two vehicles, a sensor that stopped, or different clocks?"
     )
     return f"{', '.join(dict.fromkeys(c.pair for c in wrong))} contradict each other: {worst.text}; {advice}"
+
+
+def as_options(mapping: str) -> list[str]:
+    """The options of a command that hold the lines of a mapping, `--mapping 'velocity.turned = 20'` each."""
+    return [f"--mapping '{line}'" for line in mapping.splitlines()]
 
 
 def _disagreements(
@@ -152,6 +159,7 @@ def _likeliest(windows: Windows, columns: Columns, moving: list[Pair]) -> Fault 
     if any(p.left > DISAGREE for p in moving):
         faults += _turns(windows, columns)
     best: tuple[float, Fault] | None = None
+    mending: list[tuple[float, Fault]] = []
     for fault in faults:
         after = {p.name: p.left for p in windows.mended(columns, moving, fault) if p.name in before}
         if not all(left < MENDED or left <= before[name].left for name, left in after.items()):
@@ -161,12 +169,29 @@ def _likeliest(windows: Windows, columns: Columns, moving: list[Pair]) -> Fault 
         }
         if not mended or any(p.left > DISAGREE and n not in mended for n, p in before.items()):
             continue
-        # what is left below 0.3 % is noise, and faults that differ by half a unit of log mend alike
+        # what is left below 0.3 % is noise
         misfit = sum(float(np.log(max(left, 0.003))) for left in after.values())
-        alike = best is not None and misfit < best[0] + 0.5 and fault.rank < best[1].rank
-        if best is None or misfit < best[0] - 0.5 or alike:
+        mending.append((misfit, fault))
+        alike = best is not None and misfit < best[0] + ALIKE and fault.rank < best[1].rank
+        if best is None or misfit < best[0] - ALIKE or alike:
             best = (misfit, fault)
-    return None if best is None else best[1]
+    return None if best is None else _with_doubt(*best, mending)
+
+
+def _with_doubt(misfit: float, best: Fault, mending: list[tuple[float, Fault]]) -> Fault:
+    """The best of the faults that mend; where others of its columns do as well, with the axes by which they differ."""
+    if best.axes is None:
+        return best
+    others = [f.axes for left, f in mending if left < misfit + ALIKE and f.names == best.names]
+    unsure = [
+        axis
+        for k, axis in enumerate("xyz")
+        if any(axes is not None and not np.array_equal(axes[k], best.axes[k]) for axes in others)
+    ]
+    if not unsure or not np.isnan(best.angle):
+        return best
+    doubt = f"{best.cause} (of {' and '.join(unsure)} the flight does not tell it)"
+    return replace(best, cause=doubt)
 
 
 def _turns(windows: Windows, columns: Columns) -> Iterator[Fault]:
@@ -221,7 +246,7 @@ def _undelayed(windows: Windows, columns: Columns) -> tuple[Columns, list[Check]
         what = "the attitude" if name == ROTATION else " and ".join(shifted)
         side = "later" if late > 0 else "earlier"
         text = f"{what} lagged the IMU: {1e3 * abs(late):.0f} ms {side}, shifted back"
-        mapping = "\n".join(f"[{n}] late = {late:.3f}" for n in shifted)
+        mapping = "\n".join(f"{n}.late = {late:.3f}" for n in shifted)
         checks.append(Check(name, "undone", left, text, mapping, late=late))
     return out, checks
 

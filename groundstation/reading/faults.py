@@ -30,7 +30,8 @@ LATER = [3, 0, 1, 2]  # w, x, y, z out of x, y, z, w
 
 @dataclass(frozen=True)
 class Fault:
-    """Something a log may have wrong: what it is, the mapping that mends it, and the columns as they would be right.
+    """Something a log may have wrong: what it is, the lines of a mapping that mend it, and the columns as they would be
+    right.
 
     `rank` orders faults that mend alike, the commoner first. `angle` in rad where the fault is a turn. Where vectors
     are in other axes, `axes` (3, 3) takes the columns `names` to their own.
@@ -58,7 +59,7 @@ def single_faults(columns: Columns, only_mirrored: bool = False) -> Iterator[Fau
 
 def turned(cause: str, angle: float, names: tuple[str, ...], rank: int = 0) -> Fault:
     """Vectors turned about z by `angle` rad; `cause` has braces where the angle is told."""
-    mapping = "\n".join(f"[{n}] turned = {np.degrees(angle):.0f}" for n in names)
+    mapping = "\n".join(f"{n}.turned = {np.degrees(angle):.0f}" for n in names)
     told = cause.format(f"{np.degrees(angle):.0f} degrees")
     axes = about_z(-angle)
     return Fault(told, mapping, partial(_by_axes, names=names, axes=axes), rank, angle, names, axes)
@@ -98,20 +99,20 @@ def _all_from_ned(columns: Columns) -> Columns:
 def _of_the_quaternion(columns: Columns) -> Iterator[Fault]:
     if "quaternion" not in columns:
         return
-    order, inverse = 'order = "xyzw"', "inverse = true"
+    order, inverse = 'quaternion.order = "xyzw"', "quaternion.inverse = true"
     ways: tuple[tuple[str, str, Callable[[np.ndarray], np.ndarray]], ...] = (
         ("the quaternion's columns are in the order x, y, z, w", order, lambda q: q[:, LATER]),
         ("the quaternion is world to body", inverse, lambda q: q * CONJUGATE),
         (
             "the quaternion is in the order x, y, z, w and world to body",
-            f"{order}, {inverse}",
+            f"{order}\n{inverse}",
             lambda q: q[:, LATER] * CONJUGATE,
         ),
-        ("the quaternion is in NED and FRD axes", 'frame = "ned_frd"', enu_flu_from_ned_frd),
-        ("the quaternion's body is in FRD axes", "(its y and z turned over)", _from_frd_body),
+        ("the quaternion is in NED and FRD axes", 'quaternion.frame = "ned_frd"', enu_flu_from_ned_frd),
+        ("the quaternion's body is in FRD axes", 'quaternion.body = "frd"', _from_frd_body),
     )
     for cause, mapping, mend in ways:
-        yield Fault(cause, f"[quaternion] {mapping}", partial(_by_quaternion, mend=mend))
+        yield Fault(cause, mapping, partial(_by_quaternion, mend=mend))
 
 
 def _of_the_frame(columns: Columns) -> Iterator[Fault]:
@@ -130,15 +131,15 @@ def _of_units(columns: Columns) -> Iterator[Fault]:
         if name in columns:
             for unit, factor in choices:
                 mend = partial(_by_factor, name=name, factor=factor)
-                yield Fault(f"{words} is in {unit}", f'[{name}] unit = "{unit}"', mend)
+                yield Fault(f"{words} is in {unit}", f'{name}.unit = "{unit}"', mend)
 
 
 def _of_body_axes(columns: Columns) -> Iterator[Fault]:
     if {"velocity", "quaternion"} <= set(columns):
-        told, mapping = "the velocity is in body axes{}, not in the world's", '[velocity] axes = "body"'
+        told, mapping = "the velocity is in body axes{}, not in the world's", 'velocity.axes = "body"'
         yield Fault(told.format(""), mapping, partial(_by_attitude, axes=np.eye(3)))
         frd = partial(_by_attitude, axes=FLU_FROM_FRD)
-        yield Fault(told.format(" (FRD)"), f'{mapping}, frame = "ned_frd"', frd, 1)
+        yield Fault(told.format(" (FRD)"), f'{mapping}\nvelocity.frame = "ned_frd"', frd, 1)
 
 
 def _of_exchanged_axes(columns: Columns, only_mirrored: bool) -> Iterator[Fault]:
@@ -156,14 +157,15 @@ def _of_exchanged_axes(columns: Columns, only_mirrored: bool) -> Iterator[Fault]
         for axes in SIGNED[1:8] if only_mirrored else SIGNED[1:]:
             mend = partial(_by_axes, names=names, axes=axes)
             if np.array_equal(axes, usual):
-                mapping = "\n".join(f'[{n}] frame = "ned_frd"' for n in names)
+                mapping = "\n".join(f'{n}.frame = "ned_frd"' for n in names)
                 yield Fault(f"{what} in {frame} axes", mapping, mend, 1, names=names, axes=axes)
                 continue
             named = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in axes]
             listed = ", ".join(f'"{axis}"' for axis in named)
             cause = f"{what} in other axes: x, y, z are {whose} {', '.join(named)}"
-            mapping = "\n".join(f"[{n}] axes = [{listed}]" for n in names)
-            yield Fault(cause, mapping, mend, 4, names=names, axes=axes)
+            mapping = "\n".join(f"{n}.axes = [{listed}]" for n in names)
+            mirrored = np.linalg.det(axes) < 0  # what is mounted otherwise is turned
+            yield Fault(cause, mapping, mend, 5 if mirrored else 4, names=names, axes=axes)
 
 
 def turned_about_z(quaternion: np.ndarray, angle: float) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trueflight.groundstation.reading.assemble import assemble
+from trueflight.groundstation.reading.mapping import Given, apply_mapping, load_mapping, merged, read_mappings
 from trueflight.groundstation.reading.table import Table, own_columns, read_table, unknown_columns
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -18,47 +19,51 @@ ENDINGS = (*TABLES, *RECORDS, *ULOGS)
 
 
 def read_flight(
-    path: str | Path, vehicle: str | Path | Vehicle | None = None, mapping: str | Path | None = None
+    path: str | Path, vehicle: str | Path | Vehicle | None = None, mapping: Given = None
 ) -> Flight:
     """Read a flight: the project's CSV or Parquet, any table through a column `mapping`, MCAP record, MCAP of
     ROS 2, or PX4 ULog.
 
     `vehicle` is a vehicle or its file; without it the one beside the flight is taken (a record of the
     companion carries its own): `NAME.vehicle.toml` with the longest NAME that the flight's name starts with,
-    or `vehicle.toml`. A mapping is found in the same way (`NAME.mapping.toml`, `mapping.toml`). Raises
-    `InputError`, in one line, for whatever makes the file unfit for analysis.
+    or `vehicle.toml`. A mapping is found in the same way (`NAME.mapping.toml`, `mapping.toml`);
+    lines such as "velocity.turned = 20" correct what it, or a log, says. Raises `InputError`, in one line, for
+    whatever makes the file unfit for analysis.
     """
     path = Path(path)
     with unreadable(path, "the flight", "record or export it again"):
         return _read_flight(path, vehicle, mapping)
 
 
-def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: str | Path | None) -> Flight:
+def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Given) -> Flight:
     suffix = path.suffix.lower()
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the path (`groundstation flights DIR` lists flights)")
+    mappings = read_mappings(mapping)
+    corrections = merged([one for one in mappings if not one.names_columns])
     if suffix in RECORDS:
         from trueflight.groundstation.reading.flight_record import read_flight_record
         from trueflight.groundstation.reading.px4_flight import flight_of
         from trueflight.groundstation.reading.ros_bag import is_ros_bag, load_ros_bag
 
         if is_ros_bag(path):
-            return flight_of(path, load_ros_bag(path), _vehicle(path, vehicle))
+            return flight_of(path, load_ros_bag(path), _vehicle(path, vehicle), corrections)
 
-        return read_flight_record(path, vehicle)
+        return read_flight_record(path, vehicle, corrections)
     if suffix in ULOGS:
         from trueflight.groundstation.reading.ulog import read_ulog
 
-        return read_ulog(path, _vehicle(path, vehicle))
+        return read_ulog(path, _vehicle(path, vehicle), corrections)
     if suffix not in TABLES:
         raise InputError(f"{path}: '{suffix}' is no kind of flight file; known are {', '.join(ENDINGS)}")
     table = read_table(path)
     believed = _vehicle(path, vehicle)
-    mapping = mapping or _mapping_beside(path, table)
-    if mapping is not None:
-        from trueflight.groundstation.reading.mapping import apply_mapping, load_mapping
-
-        mapped = apply_mapping(table, load_mapping(Path(mapping)), believed)
+    beside = _mapping_beside(path, table)
+    if beside is not None and not any(one.names_columns for one in mappings):
+        mappings = (load_mapping(beside), *mappings)
+    whole = merged(mappings)
+    if whole is not None and (whole.names_columns or "t" not in table.columns):
+        mapped = apply_mapping(table, whole, believed)
         return assemble(
             path, believed, mapped.t, mapped.columns, table.place,
             extra=mapped.extra, flying=None, notes=(*table.notes, *mapped.notes),
@@ -75,6 +80,7 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: str 
         extra=extra,
         flying=flying,
         notes=table.notes,
+        mapping=corrections,
     )
 
 

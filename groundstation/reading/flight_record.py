@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from trueflight.groundstation.reading.assemble import assemble
+from trueflight.groundstation.reading.mapping import Mapping
 from trueflight.groundstation.reading.rows import held
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS, Flight
@@ -29,8 +30,10 @@ KEPT = (
 )
 
 
-def read_flight_record(path: Path, vehicle: str | Path | Vehicle | None = None) -> Flight:
-    """The flight of a record. The vehicle is that of the record unless one is given.
+def read_flight_record(
+    path: Path, vehicle: str | Path | Vehicle | None = None, mapping: Mapping | None = None
+) -> Flight:
+    """The flight of a record. The vehicle is that of the record unless one is given; `mapping` corrects columns.
 
     Only what the companion itself commanded, in the air, counts as flying. Words of each tick stand as
     numbers in `extra`: `mission` (1 while the trajectory was flown), `corrected` (1 while the guard let a
@@ -76,6 +79,7 @@ def read_flight_record(path: Path, vehicle: str | Path | Vehicle | None = None) 
         extra=extra,
         commanded=commanded,
         notes=(*record.notes, *_trip(ticks["guard"], t)),
+        mapping=mapping,
     )
 
 

@@ -20,20 +20,26 @@ Quantities are the attributes of `Flight` (`models.flight.COLUMNS`), and
 * `[world_acceleration]`: kinematic acceleration in the world, gravity not in it; it becomes the specific
   force through the attitude.
 
-Each takes `unit`, `sign` (a number, or one for each column), `frame`; a quaternion also `order` and
-`inverse = true` where it turns world into body. What the reader found wrong is mended by
+Each takes `unit`, `sign` (a number, or one for each column), `frame`; a quaternion also `order`, `inverse = true` where
+it turns world into body, and `body = "frd"` where only its body is of that frame. What the reader found wrong is
+mended by
 * `turned = 20` (vectors): the log's frame is turned by so many degrees about z, anticlockwise from above; it is
   turned back;
 * `axes = ["y", "-x", "z"]` (vectors): our x, y, z are these axes of the log's; `axes = "body"` for a velocity along the
   body's axes;
 * `late = 0.1`: the values come so many seconds after what they tell, and are shifted back.
+
+A mapping without the column of `[time]` names none: it corrects what is read already, from a table in the project's
+own names or from a log. One key of it is a line that a command takes as it is: `--mapping 'velocity.turned = 20'`.
 """
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 
@@ -50,10 +56,13 @@ from trueflight.models.frames import (
     rotate,
     rotate_inverse,
 )
-from trueflight.models.outside import numbers, read_toml, shown
+from trueflight.models.outside import numbers, read_toml, shown, toml_table
 from trueflight.models.vehicle import GRAVITY, Vehicle
 
 FRAMES = ("enu_flu", "ned_frd")
+
+Given = str | Path | Sequence[str | Path] | None
+"""A mapping as it is given: a file, a line of TOML, or some of both, of which the later ones hold."""
 
 UNITS: dict[str, dict[str, tuple[float, float]]] = {
     # unit of the project: {unit in the file: (factor, offset)}, value = factor * (read - offset)
@@ -87,11 +96,25 @@ _SPECIAL = {"time": "s", "attitude": "rad", "world_acceleration": "m/s^2"}
 
 @dataclass(frozen=True)
 class Mapping:
-    """A mapping file as read: `quantities` by name, each with the keys of its table; `frame` of the file."""
+    """A mapping as read: `quantities` by name, each with the keys of its table; `frame` of the file, '' where it names
+    none."""
 
     source: str
     frame: str
     quantities: dict[str, dict[str, object]]
+
+    @property
+    def names_columns(self) -> bool:
+        """Whether it tells which column of a table is what; otherwise it corrects what was read."""
+        return "column" in self.quantities.get("time", {})
+
+    def over(self, other: Mapping | None) -> Mapping:
+        """This one over `other`, key by key."""
+        if other is None:
+            return self
+        names = [*other.quantities, *(name for name in self.quantities if name not in other.quantities)]
+        merged = {n: {**other.quantities.get(n, {}), **self.quantities.get(n, {})} for n in names}
+        return Mapping(f"{other.source}, {self.source}", self.frame or other.frame, merged)
 
 
 @dataclass(frozen=True)
@@ -105,12 +128,42 @@ class MappedTable:
     notes: tuple[str, ...]
 
 
-def load_mapping(path: Path) -> Mapping:
-    """Read and check a mapping file. Raises `InputError` with file and field for anything it does not
+def read_mappings(given: Given) -> tuple[Mapping, ...]:
+    """Read and check what is given, in its order. Raises `InputError` with source and field for anything it does not
     know."""
-    source, table = str(path), read_toml(path, "the mapping")
-    frame = table.pop("frame", "enu_flu")
-    _one_of(source, "frame", frame, FRAMES)
+    every = [given] if isinstance(given, str | Path) else given or []
+    return tuple(load_mapping(one) for one in every)
+
+
+def absolute(given: Given) -> list[str]:
+    """What is given, files by their whole paths: for another process."""
+    every = [given] if isinstance(given, str | Path) else given or []
+    return [one if _is_line(one) else str(Path(one).resolve()) for one in every]
+
+
+def _is_line(given: str | Path) -> TypeGuard[str]:
+    return isinstance(given, str) and "=" in given
+
+
+def merged(mappings: Sequence[Mapping]) -> Mapping | None:
+    """One mapping out of several, of which the later ones hold; None out of none."""
+    out = None
+    for one in mappings:
+        out = one.over(out)
+    return out
+
+
+def load_mapping(given: str | Path) -> Mapping:
+    """Read and check a mapping file, or a line of one. Raises `InputError` with source and field for anything it does
+    not know."""
+    if _is_line(given):
+        source = f"--mapping '{given}'"
+        table = toml_table(given, source, "a line is like velocity.turned = 20")
+    else:
+        source, table = str(given), read_toml(Path(given), "the mapping")
+    frame = table.pop("frame", "")
+    if frame != "":
+        _one_of(source, "frame", frame, FRAMES)
     known = [*COLUMNS, *_SPECIAL]
     quantities: dict[str, dict[str, object]] = {}
     for name, entry in table.items():
@@ -122,22 +175,22 @@ def load_mapping(path: Path) -> Mapping:
             {"roll", "pitch", "yaw", "unit", "sign", "frame", "late"} if name == "attitude" else set(_KEYS)
         )
         if name == "quaternion":
-            allowed |= {"order", "inverse"}
+            allowed |= {"order", "inverse", "body"}
         if name in (*WORLD, *BODY):
             allowed |= {"turned", "axes"}
         for key in entry:
             if key not in allowed:
                 hint = _suggestion(key, sorted(allowed))
                 raise InputError(f"{source}: [{name}] has an unknown key '{key}'; {hint}")
-        _one_of(source, f"[{name}] frame", entry.get("frame", frame), FRAMES)
+        _one_of(source, f"[{name}] frame", entry.get("frame", FRAMES[0]), FRAMES)
         quantities[name] = entry
-    if "time" not in quantities:
-        raise InputError(f'{source}: [time] is missing; add it with column = "..." and unit = "s"')
     return Mapping(source, str(frame), quantities)
 
 
 def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTable:
     """Translate a table. Raises `InputError` for a column that is not there or a unit that does not fit."""
+    if not mapping.names_columns:
+        raise InputError(f'{mapping.source}: [time] is missing; add it with column = "..." and unit = "s"')
     used: set[str] = set()
     columns: dict[str, np.ndarray] = {}
     notes: list[str] = []
@@ -168,6 +221,38 @@ def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTab
     columns = _mended(mapping, t, columns)
     extra = {name: column for name, column in table.columns.items() if name not in used}
     return MappedTable(t - t[0], columns, extra, tuple(notes))
+
+
+def corrected_time(mapping: Mapping, t: np.ndarray, vehicle: Vehicle) -> np.ndarray:
+    """The clock (N,) in s, in the unit that a mapping tells."""
+    return _in_unit(mapping, "time", t, vehicle, 1, "s") if "time" in mapping.quantities else t
+
+
+def corrected(
+    mapping: Mapping, t: np.ndarray, columns: dict[str, np.ndarray], vehicle: Vehicle
+) -> dict[str, np.ndarray]:
+    """Columns (N, ...) that were read already, by attribute of `Flight`, in the units, frames, order and time that a
+    mapping tells. Raises `InputError` for a quantity that is not there, or a key that names columns."""
+    out = dict(columns)
+    for name, entry in mapping.quantities.items():
+        if name == "time":
+            continue
+        column = "quaternion" if name == "attitude" else name
+        if column not in columns:
+            raise InputError(
+                f"{mapping.source}: there is no {name} to correct; {_suggestion(name, sorted(columns))}"
+            )
+        if naming := {"column", "columns", "roll", "pitch", "yaw"} & set(entry):
+            raise InputError(
+                f"{mapping.source}: [{name}] {sorted(naming)[0]} names columns, and a mapping of columns needs [time]"
+            )
+    entries = {n: mapping.quantities.get(n, {}) for n in columns if n in COLUMNS}
+    whole = Mapping(mapping.source, mapping.frame, entries)
+    for name in entries:
+        names, unit, _ = COLUMNS[name]
+        values = _in_unit(whole, name, columns[name], vehicle, len(names), unit)
+        out[name] = _in_frame(whole, name, values)
+    return _mended(mapping, t, out)
 
 
 def _mended(mapping: Mapping, t: np.ndarray, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -239,6 +324,14 @@ def _quantity(
     used.update(names)
     read = [table.column(n, f" for [{name}] of {mapping.source}") for n in names]
     values = read[0].copy() if count == 1 else np.stack(read, -1)
+    return _in_unit(mapping, name, values, vehicle, count, unit)
+
+
+def _in_unit(
+    mapping: Mapping, name: str, values: np.ndarray, vehicle: Vehicle, count: int, unit: str
+) -> np.ndarray:
+    """Values (N,) or (N, count) of one quantity with the mapping's signs, in the project's `unit`."""
+    entry = mapping.quantities[name]
     values = values * _signs(mapping.source, name, entry.get("sign", 1), count)
     given = entry.get("unit", unit)
     if name == "thrust_command" and given == "N":
@@ -296,18 +389,21 @@ def _in_frame(mapping: Mapping, name: str, values: np.ndarray) -> np.ndarray:
         _one_of(mapping.source, "[quaternion] order", order, ("wxyz", "xyzw"))
         values = values[:, [3, 0, 1, 2]] if order == "xyzw" else values
         values = values * [1.0, -1.0, -1.0, -1.0] if entry.get("inverse", False) else values
+        body = entry.get("body", "flu")
+        _one_of(mapping.source, "[quaternion] body", body, ("flu", "frd"))
+        values = values * [1.0, 1.0, -1.0, -1.0] if body == "frd" else values
         return enu_flu_from_ned_frd(values) if ned else values
+    if ned and (name in BODY or mapping.quantities[name].get("axes") == "body"):
+        return flu_from_frd(values)
     if ned and name in WORLD:
         return enu_from_ned(values)
-    if ned and name in BODY:
-        return flu_from_frd(values)
     if ned and name == "yaw_reference":
         return np.pi / 2 - values
     return values
 
 
 def _frame(mapping: Mapping, name: str) -> str:
-    return str(mapping.quantities[name].get("frame", mapping.frame))
+    return str(mapping.quantities[name].get("frame", mapping.frame or FRAMES[0]))
 
 
 def _unit(source: str, name: str, given: object, wanted: str) -> tuple[float, float]:

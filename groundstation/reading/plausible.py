@@ -56,7 +56,7 @@ def check_clock(t: np.ndarray, place: Callable[[int], str]) -> None:
             if 5e-4 <= dt * factor <= 1.0 / LOWEST_RATE:
                 raise InputError(
                     f"{place(0)}: the time steps by {dt:g} from row to row; is it in {unit}? It must be in s "
-                    f'(a mapping converts it: [time] unit = "{unit}")'
+                    f"(--mapping 'time.unit = \"{unit}\"' converts it)"
                 )
         raise InputError(
             f"{place(0)}: sampled at {1 / dt:.3g} Hz; at least {LOWEST_RATE:g} Hz are needed, 100 Hz is good"
@@ -83,7 +83,7 @@ def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -
             raise InputError(
                 f"{origin}: {COLUMNS[name][2]} reaches {peak:.0f} rad/s; is it in deg/s? Convert it to "
                 "rad/s, "
-                'or map it with unit = "deg/s"'
+                f"or read it with --mapping '{name}.unit = \"deg/s\"'"
             )
     if (u := columns.get("thrust_command")) is not None:
         _check_thrust(u, origin)
@@ -93,7 +93,7 @@ def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -
             raise InputError(
                 f"{origin}: battery_voltage is {level:.0f} V, the vehicle's nominal voltage "
                 f"{vehicle.nominal_voltage:g} V; "
-                'is it in mV? Map it with unit = "mV"'
+                "is it in mV? Read it with --mapping 'battery_voltage.unit = \"mV\"'"
             )
     if (motors := columns.get("motor_command")) is not None:
         _check_motors(motors, origin)
@@ -105,7 +105,8 @@ def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -
         and _high(yaw[:, None]) > 60
     ):
         raise InputError(
-            f'{origin}: yaw_reference reaches {_high(yaw[:, None]):.0f} rad; in degrees? Use unit = "deg"'
+            f"{origin}: yaw_reference reaches {_high(yaw[:, None]):.0f} rad; in degrees? Read it with "
+            "--mapping 'yaw_reference.unit = \"deg\"'"
         )
 
 
@@ -124,13 +125,13 @@ def without_wrong_voltage(
     if abs(level - 65.535) < 0.01 or abs(level - 65535.0) < 1.0:
         guess = "65535 is what drivers write that have no reading"
     elif cells > 1 and PACK[0] <= level / CELL <= PACK[1]:
-        guess = f'per cell of {cells}? Map it with unit = "V", or multiply it by {cells}'
+        guess = f"per cell of {cells}? Multiply it by {cells}"
     elif np.nanmin(volts) >= 0.0 and np.nanmax(volts) <= 1.001:
         guess = "a share of the charge? It must be in volts"
     elif np.nanmax(volts) <= 100.5 and level > PACK[1] * nominal:
         guess = "in percent? It must be in volts"
     elif PACK[0] <= 1e-3 * level / nominal <= PACK[1]:
-        guess = 'in mV? Map it with unit = "mV"'
+        guess = "in mV? Read it with --mapping 'battery_voltage.unit = \"mV\"'"
     else:
         guess = "correct nominal_voltage of the vehicle file, or the unit"
     note = f"the battery voltage, {level:.3g} V, is implausible for {nominal:g} V nominal and was left out ({guess})"
@@ -155,39 +156,41 @@ def check_sensors(t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndar
             )
 
 
-def check_specific_force(columns: dict[str, np.ndarray], flying: np.ndarray, origin: str) -> None:
-    """In flight the accelerometer feels the thrust: about +9.8 m/s² along body z (FLU) on average."""
+def implausible_force(columns: dict[str, np.ndarray], flying: np.ndarray) -> str:
+    """What is wrong with an accelerometer that does not feel the thrust in flight, about +9.8 m/s² along body z (FLU)
+    on average; '' where it does, or where there is none."""
     f = columns.get("specific_force")
     if f is None:
-        return
+        return ""
     x, y, z = np.median(f[flying], axis=0)
     norm = float(np.median(np.linalg.norm(f[flying], axis=1)))
     spread = float(np.subtract(*np.quantile(f[flying, 2], [0.75, 0.25])))
     if 0.5 < norm < 2.0 and abs(z) > 0.8 * norm and spread < 0.5 * norm:
-        raise InputError(
-            f"{origin}: specific_force is {norm:.2f} m/s^2 in flight, which looks like g; convert it to "
+        return (
+            f"specific_force is {norm:.2f} m/s^2 in flight, which looks like g; convert it to "
             "m/s^2, "
-            'or map it with unit = "g"'
+            "or read it with --mapping 'specific_force.unit = \"g\"'"
         )
     if norm > 0.5 * GRAVITY and z < -0.5 * norm:
-        raise InputError(
-            f"{origin}: specific_force_z is {z:.1f} m/s^2 in flight, but up is positive (body FLU); if the "
+        return (
+            f"specific_force_z is {z:.1f} m/s^2 in flight, but up is positive (body FLU); if the "
             "log is in "
-            'NED and FRD, map it with frame = "ned_frd"'
+            "NED and FRD, read it with --mapping 'frame = \"ned_frd\"'"
         )
     if norm < 0.3 * GRAVITY:
-        raise InputError(
-            f"{origin}: specific_force is only {norm:.2f} m/s^2 in flight: gravity was taken out of it; "
+        return (
+            f"specific_force is only {norm:.2f} m/s^2 in flight: gravity was taken out of it; "
             "give the raw "
             "accelerometer, or map the columns as [world_acceleration] if they are in the world frame"
         )
     if max(abs(x), abs(y)) > 0.7 * norm:
         axis = "x" if abs(x) > abs(y) else "y"
-        raise InputError(
-            f"{origin}: specific_force points along body {axis} in flight ({x:.1f}, {y:.1f}, {z:.1f} "
+        return (
+            f"specific_force points along body {axis} in flight ({x:.1f}, {y:.1f}, {z:.1f} "
             "m/s^2), thrust acts "
             "along z; map the axes in the order forward, left, up"
         )
+    return ""
 
 
 def body_rate(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
@@ -207,13 +210,13 @@ def _check_motors(motors: np.ndarray, origin: str) -> None:
     if high <= 1.5 and low >= -1.05:
         return
     if low >= 900 and high <= 2500:
-        guess = 'microseconds of PWM? Map it with unit = "pwm"'
+        guess = "microseconds of PWM? Read them with --mapping 'motor_command.unit = \"pwm\"'"
     elif low >= 0 and high <= 2100 and high > 105:
-        guess = 'DShot (48 to 2047)? Map it with unit = "dshot"'
+        guess = "DShot (48 to 2047)? Read them with --mapping 'motor_command.unit = \"dshot\"'"
     elif low >= 0 and high <= 105:
-        guess = 'in percent? Map it with unit = "percent"'
+        guess = "in percent? Read them with --mapping 'motor_command.unit = \"percent\"'"
     elif high <= 66000 and low >= 0:
-        guess = 'a 16-bit command? Map it with unit = "u16"'
+        guess = "a 16-bit command? Read them with --mapping 'motor_command.unit = \"u16\"'"
     else:
         guess = "give them as 0 to 1 of full throttle"
     raise InputError(
@@ -239,7 +242,8 @@ def _check_rotor_speed(speed: np.ndarray, vehicle: Vehicle, origin: str) -> None
         if COEFFICIENT[0] <= coefficient / factor**2 <= COEFFICIENT[1]:
             raise InputError(
                 f"{origin}: rotor speeds of {median:.0f} rad/s do not fit rotors of {radius:.3g} m that carry "
-                f'{vehicle.mass:.3g} kg; are they in {unit}? Map them with unit = "{unit}"'
+                f"{vehicle.mass:.3g} kg; are they in {unit}? Read them with --mapping "
+                f"'rotor_speed.unit = \"{unit}\"'"
             )
     raise InputError(
         f"{origin}: rotor speeds of {median:.0f} rad/s do not fit rotors of {radius:.3g} m that carry "
@@ -252,17 +256,18 @@ def _check_thrust(u: np.ndarray, origin: str) -> None:
     if low < -0.05:
         raise InputError(
             f"{origin}: thrust_command goes down to {low:.3g}; up is positive (0 to 1). If the log is in "
-            "FRD, map it "
-            "with sign = -1"
+            "FRD, read it with --mapping 'thrust_command.sign = -1'"
         )
     if high <= 1.5:
         return
     if high > 2500:
-        guess = 'a 16-bit command? Map it with unit = "u16"'
+        guess = "a 16-bit command? Read it with --mapping 'thrust_command.unit = \"u16\"'"
     elif high > 900:
-        guess = 'a pulse width? Map it with unit = "pwm"'
+        guess = "a pulse width? Read it with --mapping 'thrust_command.unit = \"pwm\"'"
     elif high <= 105:
-        guess = 'in percent, or in newtons? Map it with unit = "percent" or "N"'
+        guess = (
+            'in percent, or in newtons? Read it with --mapping \'thrust_command.unit = "percent"\', or "N"'
+        )
     else:
         guess = "divide it by full collective"
     raise InputError(f"{origin}: thrust_command reaches {high:.4g}, it is 0 to 1 of full collective; {guess}")

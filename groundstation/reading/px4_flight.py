@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from trueflight.groundstation.reading.assemble import assemble
+from trueflight.groundstation.reading.mapping import Mapping
 from trueflight.groundstation.reading.px4_airborne import (
     RATE,
     Airborne,
@@ -46,7 +47,7 @@ AFFECTS_THRUST = ("THR_MDL_FAC", "MC_BAT_SCALE_EN", "MPC_THR_CURVE", "PWM_", "DS
                   "SIH_", "MC_AIRMODE")  # fmt: skip
 
 
-def flight_of(path: Path, log: Log, vehicle: Vehicle) -> Flight:
+def flight_of(path: Path, log: Log, vehicle: Vehicle, mapping: Mapping | None = None) -> Flight:
     """The flight of a PX4 log, on an even clock of 100 Hz.
 
     Accelerometer and gyroscope are averaged over each period, which is centred and keeps what is above 50 Hz from
@@ -96,6 +97,7 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle) -> Flight:
         commanded=(air.in_air & usable)[recorded],
         notes=tuple(notes),
         most_lost=1.0,  # what was not recorded is told, and what is left is whole
+        mapping=mapping,
     )
 
 

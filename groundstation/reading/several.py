@@ -7,21 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from trueflight.groundstation.reading.flight_file import ENDINGS, RECORDS, TABLES, ULOGS, read_flight
+from trueflight.groundstation.reading.mapping import Given
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.whole_file import is_hidden
 
 
-def read_held_out(
-    path: Path, first: Flight, vehicle: Path | None = None, mapping: Path | None = None
-) -> Flight:
+def read_held_out(path: Path, first: Flight, vehicle: Path | None = None, mapping: Given = None) -> Flight:
     """A flight that `first` is checked on, of the same vehicle: the vehicle file of the first serves it, too."""
     return read_flight(path, vehicle or _vehicle_file(first), mapping)
 
 
-def read_beside(
-    path: Path, first: Flight, vehicle: Path | None = None, mapping: Path | None = None
-) -> Flight:
+def read_beside(path: Path, first: Flight, vehicle: Path | None = None, mapping: Given = None) -> Flight:
     """A flight to compare `first` with, by the vehicle file beside it or else by that of the first."""
     try:
         return read_flight(path, vehicle, mapping)
@@ -31,9 +28,7 @@ def read_beside(
         return read_flight(path, same, mapping)
 
 
-def read_together(
-    paths: Sequence[Path], vehicle: Path | None = None, mapping: Path | None = None
-) -> list[Flight]:
+def read_together(paths: Sequence[Path], vehicle: Path | None = None, mapping: Given = None) -> list[Flight]:
     """Flights to compare with the first of them, as `read_beside`, their names told apart."""
     first = read_flight(paths[0], vehicle, mapping)
     return told_apart([first, *(read_beside(path, first, vehicle, mapping) for path in paths[1:])])
@@ -51,7 +46,7 @@ def told_apart(flights: Sequence[Flight]) -> list[Flight]:
 def read_flights(
     paths: Sequence[Path],
     vehicle: Path | None = None,
-    mapping: Path | None = None,
+    mapping: Given = None,
     progress: Callable[[int, Path], None] = lambda done, file: None,
 ) -> list[Flight]:
     """The flights of files and folders, as `flights_in` lists them; `progress` is told how many were read, and the

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from trueflight.groundstation.reading.mapping import Mapping
 from trueflight.groundstation.reading.px4_flight import flight_of
 from trueflight.groundstation.reading.px4_log import load_ulog
 from trueflight.models.flight import Flight
 from trueflight.models.vehicle import Vehicle
 
 
-def read_ulog(path: Path, vehicle: Vehicle) -> Flight:
+def read_ulog(path: Path, vehicle: Vehicle, mapping: Mapping | None = None) -> Flight:
     """The flight of a PX4 ULog (1.11 to today), on an even clock of 100 Hz: see `px4_flight.flight_of`. Raises
     `InputError` for a file that is no ULog, is cut short before the flight, or lacks a needed topic."""
-    return flight_of(path, load_ulog(path), vehicle)
+    return flight_of(path, load_ulog(path), vehicle, mapping)

@@ -110,15 +110,18 @@ BAD = {
     ),
     "rates in deg/s": (scaled("angular_velocity", 57.29578), ["deg/s", "Convert it to rad/s"]),
     "commanded rates in deg/s": (scaled("body_rate_command", 57.29578), ["commanded body rates", "deg/s"]),
-    "specific force in g": (scaled("specific_force", 1 / 9.81), ["looks like g", 'unit = "g"']),
-    "specific force FRD": (scaled("specific_force", -1.0), ["up is positive", "ned_frd"]),
+    "specific force in g": (
+        scaled("specific_force", 1 / 9.81),
+        ["'specific_force.unit = \"g\"'"],
+    ),
+    "specific force FRD": (scaled("specific_force", -1.0), ['specific_force.axes = ["-x", "-y", "-z"]']),
     "gravity taken out": (
         lambda c: {**c, "specific_force_z": c["specific_force_z"] - 9.81},
         ["gravity was taken out"],
     ),
     "axes swapped": (
         lambda c: {**c, "specific_force_x": c["specific_force_z"], "specific_force_z": c["specific_force_x"]},
-        ["points along body x", "forward, left, up"],
+        ['specific_force.axes = ["z", "y", "x"]'],
     ),
     "thrust in u16": (scaled("thrust_command", 65535.0), ["16-bit", 'unit = "u16"']),
     "thrust in percent": (scaled("thrust_command", 100.0), ["percent"]),
@@ -211,7 +214,6 @@ MAPPINGS = {
         "[time]\ncolumn = 't_s'\n[position]\ncolumns = ['px_m', 'py_m', 'pz']",
         ["column 'pz' for [position]", "did you mean 'pz_m'"],
     ),
-    "no time": ("[position]\ncolumns = ['px_m', 'py_m', 'pz_m']", ["[time] is missing"]),
     "bad frame": ("frame = 'ned'\n[time]\ncolumn = 't_s'", ["frame is 'ned'", "ned_frd"]),
     "bad order": (
         "[time]\ncolumn = 't_s'\n[quaternion]\ncolumns = ['qx', 'qy', 'qz', 'qw']\norder = 'zyxw'",
@@ -235,6 +237,17 @@ def test_a_bad_mapping_is_told_in_one_line(case, tmp_path, capsys):
     line = refused(["import", log, "--mapping", mapping, "-o", tmp_path / "out.csv"], capsys)
     for word in ["my.toml", *words]:
         assert word in line, line
+
+
+def test_a_mapping_of_foreign_columns_needs_their_time(tmp_path, capsys):
+    log, mapping = tmp_path / "log.csv", tmp_path / "my.toml"
+    log.write_bytes((CRAZYFLIE / "crazyswarm2_log08.csv").read_bytes())
+    mapping.write_text("[position]\ncolumns = ['px_m', 'py_m', 'pz_m']")
+    vehicle = CRAZYFLIE / "crazyswarm2_log08.vehicle.toml"
+    line = refused(
+        ["import", log, "--mapping", mapping, "--vehicle", vehicle, "-o", tmp_path / "out.csv"], capsys
+    )
+    assert "my.toml" in line and "[time] is missing" in line
 
 
 def test_degrees_in_an_attitude_are_told(tmp_path, capsys):
