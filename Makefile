@@ -23,12 +23,16 @@ $(VENV)/.installed: pyproject.toml
 demo: setup
 	$(BIN)/groundstation demo --seed $(SEED)
 
+# WORKERS processes: one flies in real time, the others compute; tests/conftest.py tells who runs what.
+WORKERS ?= 2
+PYTEST := $(BIN)/pytest -n $(WORKERS) --dist loadgroup --no-loadscope-reorder
+
 test: setup lint
-	$(BIN)/pytest
+	$(PYTEST)
 
 # Studies, which take minutes each; CI runs them after `make test`.
 test-long: setup
-	$(BIN)/pytest -m long
+	$(PYTEST) -m long
 
 lint: setup
 	$(BIN)/ruff check .

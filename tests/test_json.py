@@ -11,6 +11,7 @@ import pytest
 import typer
 from json_schemas import SCHEMAS, schema_of, valid
 from jsonschema import Draft202012Validator
+from processes import with_parent
 from rig import free_port
 from typer.testing import CliRunner
 
@@ -99,12 +100,17 @@ def test_the_simulator(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.realtime
 def test_a_simulated_vehicle_and_its_pilot() -> None:
     own, pilot = free_port(), free_port()
     words = ["run", "--vehicle", VEHICLE, "--duration", 6, "--port", own, "--pilot-port", pilot, "--json"]
     program = "from trueflight.sim_bridge.cli import main; main()"
     bridge = subprocess.Popen(
-        [sys.executable, "-c", program, *map(str, words)], stdout=subprocess.PIPE, text=True, cwd=ROOT
+        [sys.executable, "-c", program, *map(str, words)],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        preexec_fn=with_parent,
     )
     assert bridge.stdout is not None
     lines = [bridge.stdout.readline()]

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
+from processes import with_parent
 
 from trueflight.companion.latest import mode_name
 from trueflight.models import contract
@@ -57,6 +58,7 @@ class Process:
             stderr=subprocess.STDOUT,
             text=True,
             env=environment,
+            preexec_fn=with_parent,
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()

@@ -14,6 +14,8 @@ from rig import SET_ATTITUDE_TARGET, Bridge, Companion, Wiretap, wait_for
 
 from trueflight.models.record import FlightRecord, read_record
 
+pytestmark = pytest.mark.realtime
+
 FOREVER = {"trajectory": "hover", "parameters": {"duration": 600.0}}
 
 

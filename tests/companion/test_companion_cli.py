@@ -16,6 +16,8 @@ from rig import VEHICLE, Bridge, free_port
 from trueflight.companion.settings import Settings, load_settings
 from trueflight.models.errors import InputError
 
+pytestmark = pytest.mark.realtime
+
 EXAMPLE = Path(__file__).parents[2] / "companion" / "companion.toml"
 
 

@@ -32,6 +32,8 @@ from trueflight.models import contract
 from trueflight.models.record import FlightRecord, read_record
 from trueflight.models.vehicle import load_vehicle
 
+pytestmark = pytest.mark.realtime
+
 SPEED = "2"
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml")
 SLEW = np.array(GuardLimits().slew)

@@ -16,6 +16,8 @@ from test_companion_cli import companion
 
 from trueflight.companion.estimator import EstimatorStatus, estimator_status
 
+pytestmark = pytest.mark.realtime
+
 MOST = 2.0
 
 

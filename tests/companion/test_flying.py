@@ -17,6 +17,8 @@ from trueflight.models import contract, frames
 from trueflight.models.record import FlightRecord, read_record
 from trueflight.models.record_pb2 import Event
 
+pytestmark = pytest.mark.realtime
+
 SPEED = "2"
 
 

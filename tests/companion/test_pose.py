@@ -20,6 +20,8 @@ from trueflight.companion.pose import PoseFeed, PoseGate, PoseSettings
 from trueflight.models import contract
 from trueflight.models.pose import Pose, pose_from_json, pose_to_json
 
+pytestmark = pytest.mark.realtime
+
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 coordinates = st.floats(-50.0, 50.0)
 angles = st.floats(-math.pi, math.pi)

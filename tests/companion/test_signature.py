@@ -20,6 +20,8 @@ from trueflight.models.errors import InputError
 from trueflight.models.signature import read_signature, sign
 from trueflight.models.vehicle import load_vehicle
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -16,6 +16,8 @@ from rig import Bridge, Companion, Wiretap, wait_for
 
 from trueflight.models.record import read_record
 
+pytestmark = pytest.mark.realtime
+
 LOSS_TIME = 1.0  # s: COM_OF_LOSS_T, as the bridge and PX4 have it by default
 
 HANGS = """

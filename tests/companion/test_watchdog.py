@@ -17,6 +17,8 @@ from test_silence import HANGS
 
 from trueflight.companion.watchdog import Watchdog, raise_priority
 
+pytestmark = pytest.mark.realtime
+
 
 class Manager:
     """The receiving end of sd_notify: a datagram socket."""

@@ -19,6 +19,7 @@ import numpy as np
 import psutil
 from astray import FAR, Went, away, impact, relative
 from flood import ASKED, DATAGRAMS, PUBLISHED
+from processes import with_parent
 from promise import Row, spread
 from rig import Companion
 from scene import Scene
@@ -90,7 +91,9 @@ def _flood(scene: Scene, what: str, which: str, count: int, seed: int) -> Floode
     before = _resident(scene.companion)
     program = [sys.executable, str(Path(__file__).with_name("flood.py")), what, str(port), which]
     out = Flooded(name, count, time.monotonic())
-    child = subprocess.Popen([*program, str(count), str(seed)], stdout=subprocess.PIPE, text=True)
+    child = subprocess.Popen(
+        [*program, str(count), str(seed)], stdout=subprocess.PIPE, text=True, preexec_fn=with_parent
+    )
     try:
         largest = before
         while child.poll() is None:
@@ -191,7 +194,10 @@ def _without_processor(folder: Path, busy: int, seconds: float) -> Row:
         # The vehicle, and we who look at it, keep the rest of the machine.
         _pin(scene.bridge.child.pid, (os.cpu_count() or 1) - 1)
         began = time.monotonic()
-        spinning = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
+        spinning = [
+            subprocess.Popen([sys.executable, "-c", "while True: pass"], preexec_fn=with_parent)
+            for _ in range(busy)
+        ]
         try:
             for one in spinning:
                 _pin(one.pid, 0)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from floods import floods, starved
 from promise import Row
 from rig import PATIENT
 from silences import kills
+
+pytestmark = pytest.mark.realtime
 
 
 def broken(rows: list[Row]) -> list[Row]:

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import with_parent
 from readers import QUAD5, Reader, readers
 
 from trueflight.groundstation.versions.store import newest, save
@@ -144,7 +145,7 @@ def test_a_collection_leaves_no_workers_behind_and_goes_on(how: signal.Signals, 
         words,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=with_parent,
     )
     end = time.monotonic() + 60
     while len(_workers(child.pid)) < 2 and time.monotonic() < end:

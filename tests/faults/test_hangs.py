@@ -13,6 +13,8 @@ from rig import Bridge, Companion, wait_for
 
 from trueflight.models.record import read_record
 
+pytestmark = pytest.mark.realtime
+
 LOSS_TIME = 0.5  # s: COM_OF_LOSS_T
 
 SLEEPS = """

@@ -19,6 +19,8 @@ from rig import wait_for
 
 from trueflight.models.record import read_record
 
+pytestmark = pytest.mark.realtime
+
 INJECT = Path(__file__).with_name("inject.py")
 LATEST = 0.3
 """s by which any fault here delays what the companion is told of the flight mode."""

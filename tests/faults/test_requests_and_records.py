@@ -15,6 +15,8 @@ from rig import SET_ATTITUDE_TARGET, Bridge, Companion, Wiretap, wait_for
 from trueflight.models import contract
 from trueflight.models.record import read_record
 
+pytestmark = pytest.mark.realtime
+
 SPEED = "2"
 OFFBOARD_LOSS = 1.0
 """s without a setpoint after which the stand-in's failsafe takes over (COM_OF_LOSS_T)."""

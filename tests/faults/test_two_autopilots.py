@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from rig import Bridge, Companion, free_port, wait_for
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def two_on_one_port() -> Iterator[int]:

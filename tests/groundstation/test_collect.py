@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from json_schemas import valid
+from processes import with_parent
 
 from trueflight.companion.telemetry import Telemetry, read_json
 from trueflight.companion.zenoh_session import ZenohSettings, open_session
@@ -19,6 +20,8 @@ from trueflight.groundstation.commands.app import app
 from trueflight.models.database import database
 from trueflight.models.errors import run_command_line
 from trueflight.models.record import read_record
+
+pytestmark = pytest.mark.realtime
 
 ROOT = Path(__file__).parents[2]
 QUAD5 = ROOT / "models" / "vehicles" / "quad5" / "vehicle.toml"
@@ -139,7 +142,9 @@ def test_a_real_companion_flies_a_mission_of_the_database(tmp_path):
     try:
         for command in commands:
             arguments = [str(BIN / command[0]), *map(str, command[1:])]
-            child = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+            child = subprocess.Popen(
+                arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=with_parent
+            )
             running.append(child)
             line = child.stdout.readline()
             assert line.startswith("ready:"), line + child.stdout.read()

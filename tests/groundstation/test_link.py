@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from json_schemas import valid
+from processes import with_parent
 
 from trueflight.companion.telemetry import PIECE, Telemetry, make_event, read_json
 from trueflight.companion.zenoh_session import ZenohSettings, open_session
@@ -24,6 +25,8 @@ from trueflight.groundstation.operate.settings import Settings, load_settings
 from trueflight.groundstation.output.terminal import print_warning
 from trueflight.models.errors import InputError, run_command_line
 from trueflight.models.record_pb2 import Tick
+
+pytestmark = pytest.mark.realtime
 
 ROOT = Path(__file__).parents[2]
 QUAD5 = ROOT / "models" / "vehicles" / "quad5" / "vehicle.toml"
@@ -229,7 +232,9 @@ def processes(endpoint, tmp_path):
     try:
         for command in commands:
             arguments = [str(BIN / command[0]), *map(str, command[1:])]
-            child = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+            child = subprocess.Popen(
+                arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=with_parent
+            )
             running.append(child)
             line = child.stdout.readline()
             assert line.startswith("ready:"), line + child.stdout.read()
@@ -259,6 +264,7 @@ def test_a_flight_is_asked_for_watched_fetched_and_tracked(processes, endpoint, 
         [program, "monitor", "-e", endpoint, "--save", recording, "--seconds", "6"],
         env=environment,
         stdout=subprocess.PIPE,
+        preexec_fn=with_parent,
     )
     flown = json.loads(
         ground(

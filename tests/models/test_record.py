@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import with_parent
 
 from trueflight.models.design import Design
 from trueflight.models.errors import InputError
@@ -180,7 +181,10 @@ def test_a_killed_recorder_loses_at_most_a_second(tmp_path: Path) -> None:
             time.sleep(0.01)
     """
     process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(program)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", textwrap.dedent(program)],
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=with_parent,
     )
     assert process.stdout is not None
     try:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from bridge_process import QUAD5, Bridge, free_ports
+from processes import with_parent
 
 from trueflight.models.design import Design, load_design
 from trueflight.models.vehicle import Vehicle, load_vehicle
@@ -40,6 +41,7 @@ def bridge(tmp_path: Path) -> Iterator[Callable[..., Bridge]]:
             stderr=subprocess.PIPE,
             text=True,
             cwd=tmp_path,
+            preexec_fn=with_parent,
         )
         running.append(process)
         assert process.stdout is not None

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from bridge_process import QUAD5
+from processes import with_parent
 
 from trueflight.models.database import database
 from trueflight.models.design import Design
@@ -74,13 +75,12 @@ def test_what_was_flown_before_an_interruption_stays_and_the_rest_follows(collec
     folder, _ = collected
     target = tmp_path / "cut"
     command = [*PROGRAM, *RICH, "-o", str(target), "--minutes", "3", "--jobs", "1"]
-    # a shell that runs the tests in the background may have told us to ignore what interrupts the child
     child = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=with_parent,
     )
     end = time.monotonic() + 60
     while not list(target.glob("*.mcap")) and time.monotonic() < end:

@@ -20,6 +20,8 @@ from trueflight.sim_bridge.mavlink.wire import float_of_int, int_of_float
 from trueflight.sim_bridge.modes import Mode
 from trueflight.sim_bridge.pilot import send_order
 
+pytestmark = pytest.mark.realtime
+
 mavutil.mavlink = mav
 OFFBOARD = Mode.OFFBOARD.custom_mode
 

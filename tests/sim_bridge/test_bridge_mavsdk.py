@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from bridge_process import Bridge
 
+pytestmark = pytest.mark.realtime
+
 PROGRAMS = Path(__file__).with_name("mavsdk_programs.py")
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from bridge_process import QUAD5, free_ports
 from json_schemas import valid
+from processes import with_parent
 from px4_peer import ARMED, Hover, ParameterServer, Px4Peer
 from pymavlink.dialects.v20 import common as mav
 
@@ -29,6 +30,8 @@ from trueflight.sim_bridge.sitl import lockstep
 from trueflight.sim_bridge.sitl.allocation import differences, expected_parameters
 from trueflight.sim_bridge.sitl.lockstep import Ending, Lockstep, listen
 from trueflight.sim_bridge.sitl.sensors import RawNoise, RawSensors
+
+pytestmark = pytest.mark.realtime
 
 IRIS = {
     **{"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": 4},
@@ -92,6 +95,7 @@ def sitl(tmp_path: Path) -> Iterator[Callable[..., Running]]:
             stderr=subprocess.PIPE,
             text=True,
             cwd=tmp_path,
+            preexec_fn=with_parent,
         )
         running.append(Running(process, port, link_port, []))
         assert running[-1].event("ready")["port"] == port
