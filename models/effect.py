@@ -125,7 +125,8 @@ class Effect:
     """A physical effect, ready to fit, predict, diagnose, explain and export.
 
     `needs` names the columns of `models.flight.COLUMNS` it reads, `needs_any` those of which one is enough;
-    `acts_through` the effects of which one must be in the model for this one to act (wind acts through drag); `exports`
+    `needs_accelerometer` is True for an error of that sensor: no acceleration that was differentiated or estimated has
+    it; `acts_through` the effects of which one must be in the model for this one to act (wind acts through drag); `exports`
     is False for an effect with memory, which a static correction cannot hold. `generalises` names simpler effects with
     which this one coincides unless the flight varies what it depends on (a bent thrust curve in a hover is a thrust
     gain). `aliases` are physical quantities that no flight can tell apart from this effect. `unconfounded` is the
@@ -162,6 +163,7 @@ class Effect:
     generalises: tuple[str, ...] = ()
     exports: bool = True
     needs_any: tuple[str, ...] = ()
+    needs_accelerometer: bool = False
     unconfounded: str = ""
     rotational: bool = False
     seen_as: tuple[str, ...] = ()
@@ -185,6 +187,8 @@ class Effect:
         missing = [n for n in self.needs if not flight.has(n)]
         if self.needs_any and not any(flight.has(n) for n in self.needs_any):
             missing.append(" or ".join(self.needs_any))
+        if self.needs_accelerometer and not flight.accelerometer:
+            missing.append("an accelerometer")
         return tuple(missing)
 
     def neutral(self, vehicle: Vehicle) -> dict[str, float]:

@@ -90,9 +90,9 @@ class Flight:
 
     `t` (N,) in s, strictly increasing; every other column has N rows or is None. World ENU, body FLU, quaternion
     w, x, y, z body to world, SI units. `flying` (N,) bool marks the samples to analyse (in the air, under the
-    recorded commands). `accelerometer` is False where `specific_force` was differentiated from the trajectory;
-    `bandwidth` is then its bandwidth in Hz, otherwise None. `sensor_rate` is the rate in Hz at which the accelerometer
-    (or velocity) has new values, where the log repeats them; otherwise None.
+    recorded commands). `accelerometer` is False where `specific_force` was differentiated from the trajectory or is an
+    estimator's; `bandwidth` is then its bandwidth in Hz, otherwise None. `sensor_rate` is the rate in Hz at which the
+    accelerometer (or velocity) has new values, where the log repeats them; otherwise None.
     `origin` is the file, `data_hash` its SHA-256.
     `notes` tells what the reader had to do (resampling, gaps, cut takeoff), `consistency` which of its columns agree.
     """

@@ -67,7 +67,8 @@ def _print_effect(e: Effect) -> None:
         unit = "" if p.unit == "1" else f" {p.unit}"
         console.print(f"  {p.name}: {p.meaning}, {p.low:g} to {p.high:g}{unit}")
     either = f"{', ' if e.needs else ''}{' or '.join(e.needs_any)}" if e.needs_any else ""
-    console.print(f"needs: {', '.join(e.needs)}{either}")
+    sensor = ", from an accelerometer" if e.needs_accelerometer else ""
+    console.print(f"needs: {', '.join(e.needs)}{either}{sensor}")
     console.print(f"fly: {e.manoeuvre}")
     console.print(f"confounded with: {', '.join((*e.confounded_with, *e.aliases)) or e.unconfounded}")
     console.print(f"source: {e.citation}")

@@ -98,9 +98,7 @@ class ForceProblem:
         return mean_square_before(self.flights, self.base)
 
     def _measurable(self, effect: Effect) -> bool:
-        if effect.rotational or (effect.stage is Stage.SENSOR and not self.flight.accelerometer):
-            return False
-        return bool(effect.parameters) and not effect.lacks(self.flight)
+        return not effect.rotational and bool(effect.parameters) and not effect.lacks(self.flight)
 
     def at_rest(self, effect: Effect) -> dict[str, float]:
         """Parameter values without effect, placed where it would act on this flight."""

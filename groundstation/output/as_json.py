@@ -301,6 +301,7 @@ def effect_table(e: Effect) -> dict[str, Any]:
         },
         "needs": list(e.needs),
         "needs_any": list(e.needs_any),
+        "needs_accelerometer": e.needs_accelerometer,
         "seen_in": "rotation" if e.rotational else "acceleration",
         "manoeuvre": e.manoeuvre,
         "confounded_with": list(e.confounded_with),

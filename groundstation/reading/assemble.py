@@ -32,10 +32,12 @@ def assemble(
     notes: tuple[str, ...] = (),
     most_lost: float = MOST_LOST,
     mapping: Mapping | None = None,
+    accelerometer: bool = True,
 ) -> Flight:
     """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
     find what was flown. `place(row)` names a row in messages; `most_lost` is the share of samples that gaps may
-    take; `mapping` corrects the columns. Raises `InputError` for anything that cannot be analysed."""
+    take; `mapping` corrects the columns; `accelerometer` is False where the specific force is an estimator's. Raises
+    `InputError` for anything that cannot be analysed."""
     origin = str(path)
     _check_groups(origin, columns)
     columns, dead = rows.without_dead_battery(columns)
@@ -83,7 +85,7 @@ def assemble(
         t=t[agreed.keep],
         **agreed.columns,  # type: ignore[arg-type]
         flying=in_air[agreed.keep],
-        accelerometer="specific_force" in given,
+        accelerometer=accelerometer and "specific_force" in given,
         sensor_rate=agreed.rates.get("specific_force" if "specific_force" in given else "velocity"),
         origin=origin,
         data_hash=hashlib.sha256(path.read_bytes()).hexdigest(),

@@ -67,6 +67,7 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Give
         return assemble(
             path, believed, mapped.t, mapped.columns, table.place,
             extra=mapped.extra, flying=None, notes=(*table.notes, *mapped.notes),
+            accelerometer=not mapped.estimated_force,
         )  # fmt: skip
     columns = own_columns(table)
     extra = unknown_columns(table)

@@ -120,12 +120,13 @@ class Mapping:
 @dataclass(frozen=True)
 class MappedTable:
     """A foreign table in the project's names, units and frames; `extra` are the columns that nothing
-    claimed."""
+    claimed, `estimated_force` whether its specific force is an estimator's and no accelerometer's."""
 
     t: np.ndarray
     columns: dict[str, np.ndarray]
     extra: dict[str, np.ndarray]
     notes: tuple[str, ...]
+    estimated_force: bool = False
 
 
 def read_mappings(given: Given) -> tuple[Mapping, ...]:
@@ -220,7 +221,7 @@ def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTab
         notes.append("the specific force is the logged world acceleration plus gravity, in body axes")
     columns = _mended(mapping, t, columns)
     extra = {name: column for name, column in table.columns.items() if name not in used}
-    return MappedTable(t - t[0], columns, extra, tuple(notes))
+    return MappedTable(t - t[0], columns, extra, tuple(notes), world is not None)
 
 
 def corrected_time(mapping: Mapping, t: np.ndarray, vehicle: Vehicle) -> np.ndarray:

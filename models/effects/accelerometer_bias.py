@@ -22,6 +22,7 @@ EFFECT = Effect(
         for axis in ("x", "y", "z")
     ),
     needs=("specific_force",),
+    needs_accelerometer=True,
     manoeuvre="hover at several headings, and tilts both ways",
     citation="IEEE Std 1293, bias term of the accelerometer model; range: 80 mg zero-g offset of MEMS data sheets",
     confounded_with=("thrust_gain", "thrust_curve", "wind", "thrust_misalignment"),

@@ -12,6 +12,7 @@ import pytest
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.results import Diagnosis
+from trueflight.models.effects import effect_named
 from trueflight.models.model import Term, rigid_body_model
 
 ROOT = Path(__file__).parents[2]
@@ -94,6 +95,16 @@ def test_real_crazyflies_thrust_gain_and_drag(file: str, gain: float) -> None:
     found = next(e for e in result.effects if e.name == "thrust_gain")
     assert found.parameters[0].value == pytest.approx(gain, rel=0.01)
     assert "mass" in found.indistinguishable_from
+
+
+def test_errors_of_an_accelerometer_are_not_looked_for_without_one() -> None:
+    flight = read_flight(
+        SAMPLES / "crazyflie" / "crazypad_normal_E9_log03.csv"
+    )  # an estimator's acceleration
+    assert flight.specific_force is not None and not flight.accelerometer
+    result = diagnose(flight, rigid_body_model(flight.vehicle))
+    for verdict in (e for e in result.effects if effect_named(e.name).needs_accelerometer):
+        assert verdict.verdict == "not_excited" and "an accelerometer" in verdict.advice, verdict
 
 
 def test_included_effect_is_not_looked_for_again() -> None:
