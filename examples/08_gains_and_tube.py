@@ -5,7 +5,8 @@ from pathlib import Path
 
 import trueflight as tf
 from trueflight.groundstation.design.linear_design import loops
-from trueflight.models.vehicle import QUAD5, load_vehicle
+from trueflight.models.shipped import QUAD5
+from trueflight.models.vehicle import load_vehicle
 
 OUT = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
 OUT.mkdir(parents=True, exist_ok=True)

@@ -12,11 +12,12 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from trueflight.models.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 MOST_TEXT = 64 << 20
 """Bytes of a settings, vehicle, design or model file; the largest network allowed in one has less."""
@@ -110,6 +111,8 @@ def is_number(value: object) -> bool:
 def numbers(value: object, shape: tuple[int | None, ...]) -> np.ndarray | None:
     """Nested lists of finite numbers, `value`, as an array of this `shape`, (N, 3) as (None, 3); None where they are
     anything else."""
+    import numpy as np  # texts are read by commands that compute nothing
+
     if not shape:
         return np.array(float(value)) if is_number(value) else None  # type: ignore[arg-type]
     if not isinstance(value, list | tuple) or shape[0] not in (None, len(value)):

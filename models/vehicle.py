@@ -16,9 +16,6 @@ from trueflight.models.outside import is_number, numbers, read_toml, shown
 GRAVITY = 9.81
 """Standard gravity of the project, m/s²."""
 
-QUAD5 = Path(__file__).parent / "vehicles" / "quad5" / "vehicle.toml"
-"""The vehicle that stands where none is named: the 5-inch quadrotor."""
-
 THRUST_MODELS = ("linear", "quadratic")
 
 LONGEST_NAME = 64

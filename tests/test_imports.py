@@ -183,7 +183,13 @@ def test_groundstation_never_imports_the_simulator() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["trueflight.companion.cli", "trueflight.companion.flight", "trueflight.sim_bridge.cli"]
+    "module",
+    [
+        "trueflight.companion.cli",
+        "trueflight.companion.flight",
+        "trueflight.sim_bridge.cli",
+        "trueflight.groundstation.commands.app",
+    ],
 )
 def test_a_light_process_loads_no_heavy_library(module: str) -> None:
     import subprocess
@@ -191,6 +197,8 @@ def test_a_light_process_loads_no_heavy_library(module: str) -> None:
     heavy = {"torch", "scipy", "control", "rerun", "pyarrow", "matplotlib", "pandas"}
     if module == "trueflight.companion.flight":
         heavy |= {"mavsdk", "zenoh", "onnxruntime"}  # what decides over a flight needs no wire
+    if module == "trueflight.groundstation.commands.app":
+        heavy |= {"numpy", "zenoh", "onnxruntime"}  # --help and completion answer at once
     code = f"import sys, {module}; print(sorted({heavy!r} & set(sys.modules)))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert out.stdout.strip() == "[]"

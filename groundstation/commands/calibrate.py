@@ -12,7 +12,7 @@ from rich.console import Console
 from trueflight.groundstation.commands.options import JobsOption, JsonOption
 from trueflight.groundstation.output.terminal import counted
 from trueflight.models.printed import print_json
-from trueflight.models.vehicle import QUAD5
+from trueflight.models.shipped import QUAD5
 
 if TYPE_CHECKING:
     from trueflight.groundstation.evaluate.calibration import Case

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from trueflight.models.vehicle import QUAD5
+from trueflight.models.shipped import QUAD5
 
 if TYPE_CHECKING:
     from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails

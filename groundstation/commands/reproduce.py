@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich import box
 from rich.console import Console
@@ -17,9 +17,11 @@ from rich.table import Table
 from trueflight.groundstation.commands.options import JobsOption, JsonOption, SaveOption
 from trueflight.groundstation.output.terminal import counted, print_written
 from trueflight.models.printed import print_json
-from trueflight.models.vehicle import QUAD5
+from trueflight.models.shipped import QUAD5
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from trueflight.groundstation.study.reproduce import Prepared, Scenario, Study
 
 console = Console()
@@ -186,7 +188,7 @@ def _print_prepared(prepared: Prepared) -> None:
 def _cell(values: np.ndarray) -> str:
     if values.size == 0:
         return ""
-    median, low, high = (float(x) for x in (np.median(values), values.min(), values.max()))
+    low, median, high = float(values.min()), statistics.median(values.tolist()), float(values.max())
     if values.size == 1:
         return _short(median)
     power = math.floor(math.log10(median))
@@ -203,7 +205,9 @@ def _short(value: float) -> str:
 
 
 def _ratio(before: np.ndarray, after: np.ndarray) -> str:
-    return f"{float(np.median(before) / np.median(after)):.0f}" if before.size and after.size else ""
+    if not before.size or not after.size:
+        return ""
+    return f"{statistics.median(before.tolist()) / statistics.median(after.tolist()):.0f}"
 
 
 def study_table(study: Study, scenarios: Sequence[Scenario]) -> dict[str, Any]:
@@ -218,7 +222,7 @@ def study_table(study: Study, scenarios: Sequence[Scenario]) -> dict[str, Any]:
         cell["mse"].append(list(f.mse))
     for columns in cells.values():
         for cell in columns.values():
-            cell["median"] = np.median(np.array(cell["mse"]), axis=0).tolist()
+            cell["median"] = [statistics.median(axis) for axis in zip(*cell["mse"], strict=True)]
     return {
         "unit": "m^2",
         "scenarios": {s.name: s.title for s in scenarios},

@@ -23,7 +23,6 @@ from trueflight.groundstation.commands.options import (
     VehicleOption,
 )
 from trueflight.groundstation.output.terminal import print_written
-from trueflight.groundstation.reading.mapping import Given
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
 
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from trueflight.groundstation.learn.ablation import Ablation
     from trueflight.groundstation.learn.training import Epoch, Training
     from trueflight.groundstation.learn.training_data import Samples
+    from trueflight.groundstation.reading.mapping import Given
     from trueflight.models.flight import Flight
     from trueflight.models.model import Model
 

@@ -19,7 +19,8 @@ from trueflight.models.design import Design, save_design
 from trueflight.models.effect import Effect
 from trueflight.models.effects import catalogue
 from trueflight.models.errors import InputError
-from trueflight.models.vehicle import QUAD5, Vehicle, load_vehicle
+from trueflight.models.shipped import QUAD5
+from trueflight.models.vehicle import Vehicle, load_vehicle
 
 if TYPE_CHECKING:
     from trueflight.groundstation.learn.training import Epoch

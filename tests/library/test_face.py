@@ -213,7 +213,7 @@ def test_a_flight_is_simulated_tracked_and_revealed(tmp_path: Path) -> None:
 
 
 def test_gains_are_designed() -> None:
-    from trueflight.models.vehicle import QUAD5
+    from trueflight.models.shipped import QUAD5
 
     gains = tf.design(QUAD5, bandwidth=0.4)
     assert gains.integral is not None and gains.K_eta[0][1] != 0.0
