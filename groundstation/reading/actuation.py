@@ -10,7 +10,6 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from trueflight.groundstation.reading.faults import Columns
 from trueflight.groundstation.reading.uniform import segments, slopes
@@ -22,6 +21,7 @@ LIFT = "thrust and vertical acceleration"
 MOTORS = "motor commands and thrust"
 ROTORS = "rotor speeds and motor commands"
 TORQUE = "motor commands and rotation"
+BATTERY = "battery voltage and thrust"
 
 AGAINST, LITTLE = -0.7, 0.3
 """Correlation below which two columns move against each other, and below which one does not follow the other."""
@@ -29,6 +29,10 @@ FOLLOWS = 0.6
 """Correlation from which on another order of the columns is believed, where theirs has less than half of it."""
 FAST, SLOW = 0.1, 4.0
 """s over which columns are smoothed, and over which a mean is taken away."""
+SAGS = (1.0, 10.0)
+"""s over which voltage and thrust are smoothed, and over which a mean is taken away."""
+INDEPENDENT, SURE = 1.0, 3.0
+"""s after which a change says something new, and standard deviations (of Fisher's z) from which on one is believed."""
 DIFFERENTIATED = 0.5
 """s over which an acceleration is smoothed that was differentiated from the velocity."""
 LIFTS, TURNS = 0.3, 1.0
@@ -52,7 +56,9 @@ def actuation_checks(
         return ()
     changes = _Changes(t, flying)
     return tuple(
-        check for part in (_lift, _motors, _rotors, _torque) for check in part(changes, columns, vehicle)
+        check
+        for part in (_lift, _motors, _rotors, _torque, _battery)
+        for check in part(changes, columns, vehicle)
     )
 
 
@@ -62,9 +68,12 @@ class _Changes:
     def __init__(self, t: np.ndarray, flying: np.ndarray) -> None:
         self.t, self.flying = t, flying
         self.dt = float(np.median(np.diff(t)))
+        self.seconds = float(np.sum(flying)) * self.dt
 
     def of(self, column: np.ndarray, late: float = 0.0, fast: float = FAST, slow: float = SLOW) -> np.ndarray:
         """The changes of a column (N,) or (N, k), read `late` s later, at the rows in the air."""
+        from scipy.ndimage import uniform_filter1d  # dear to load, and not every command reads a flight
+
         shift, width = round(late / self.dt), max(1, round(fast / self.dt))
         out = np.full(column.shape, np.nan)
         for part in segments(self.t):
@@ -103,18 +112,21 @@ def _lift(changes: _Changes, columns: Columns, vehicle: Vehicle) -> Iterator[Che
     fast = FAST if "specific_force" in columns else DIFFERENTIATED
     thrust = changes.of(columns["thrust_command"], fast=fast) * GRAVITY / max(vehicle.hover_thrust, 1e-3)
     felt = [changes.of(force, late, fast) for late in changes.lags()]
-    if min(np.nanstd(thrust), np.nanstd(felt[0])) < LIFTS or np.nanstd(thrust) < COVERED * np.nanstd(felt[0]):
-        yield Check(LIFT, "cannot tell", float("nan"), "the thrust changes too little to compare them")
-        return
     follows = max(_correlation(thrust, late) for late in felt)
     turned = max(_correlation(thrust, changes.of(mirrored, late, fast)) for late in changes.lags())
     what = "the accelerometer's z" if "specific_force" in columns else "the climb"
     left = 1.0 - follows if follows < 0 else 1.0 - follows**2
-    if turned > FOLLOWS and follows < 0.5 * turned:
+    sure = (
+        float(np.arctanh(min(turned, 0.999))) * np.sqrt(max(changes.seconds / INDEPENDENT - 3.0, 0.0)) > SURE
+    )
+    covered = np.nanstd(thrust) < max(LIFTS, COVERED * np.nanstd(felt[0]))
+    if sure and turned > FOLLOWS and follows < 0.5 * turned:
         names = ("specific_force",) if "specific_force" in columns else ("position", "velocity")
         mapping = "\n".join(f'{n}.axes = ["x", "y", "-z"]' for n in names if n in columns)
         text = f"{what} falls where the thrust rises: z or the thrust has the wrong sign"
         yield Check(LIFT, "contradicts", left, text, mapping)
+    elif covered and follows < FOLLOWS:
+        yield Check(LIFT, "cannot tell", float("nan"), "the thrust changes too little to compare them")
     elif follows < LITTLE:
         text = f"{what} hardly follows the thrust command (correlation {follows:.2f}): what is said of thrust is weak"
         yield Check(LIFT, "weak", left, text)
@@ -230,3 +242,25 @@ def _torque(changes: _Changes, columns: Columns, vehicle: Vehicle) -> Iterator[C
         yield Check(TORQUE, "weak", left, text)
     else:
         yield Check(TORQUE, "agrees", left)
+
+
+def _battery(changes: _Changes, columns: Columns, _vehicle: Vehicle) -> Iterator[Check]:
+    """A battery's voltage falls where the thrust rises."""
+    volts, thrust = columns.get("battery_voltage"), columns.get("thrust_command")
+    if volts is None or thrust is None:
+        return
+    flown = volts[changes.flying]
+    if np.ptp(flown) == 0.0:
+        text = f"the battery voltage is {flown[0]:.2f} V from first to last: what a battery does cannot be judged"
+        yield Check(BATTERY, "cannot tell", float("nan"), text)
+        return
+    fast, slow = SAGS
+    rises = _correlation(changes.of(thrust, fast=fast, slow=slow), changes.of(volts, fast=fast, slow=slow))
+    sure = float(np.arctanh(min(abs(rises), 0.999))) * np.sqrt(max(changes.seconds / slow - 3.0, 0.0)) > SURE
+    if not sure:
+        yield Check(BATTERY, "cannot tell", float("nan"), "the voltage changes too little to compare them")
+    elif rises > 0.0:
+        text = f"the battery voltage rises with the thrust (correlation {rises:.2f}): not its own?"
+        yield Check(BATTERY, "weak", 1.0 + rises, text)
+    else:
+        yield Check(BATTERY, "agrees", 1.0 - rises**2)

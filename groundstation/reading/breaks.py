@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from trueflight.groundstation.reading.plausible import body_rate
 from trueflight.groundstation.reading.uniform import gap_length, segments
@@ -17,6 +16,8 @@ WITHIN = 0.15
 """s that a step may take: a log's own rate is interpolated to that of the others."""
 SURE = 10.0
 """Standard deviations of its own noise, by the median, from which on a step is one."""
+CHI_MEDIAN = {1: 0.67449, 3: 1.53817}
+"""Median length of a vector of so many standard normal numbers."""
 LEAST = {"velocity": 0.5, "position": 0.5, "heading": float(np.radians(8.0))}
 """m/s, m, rad; smaller steps are corrections that every estimator makes."""
 UNITS = {"velocity": "m/s", "position": "m", "heading": "degrees"}
@@ -152,7 +153,7 @@ def _large(what: str, t: np.ndarray, total: np.ndarray, scale: int, flying: np.n
     whole &= flying[scale:] & flying[:-scale]
     if not np.any(whole):
         return np.array([], dtype=int)
-    noise = float(np.median(change[whole]) / stats.chi.median(total.shape[1]))
+    noise = float(np.median(change[whole]) / CHI_MEDIAN[total.shape[1]])
     return np.flatnonzero(whole & (change > max(SURE * noise, LEAST[what])))
 
 

@@ -48,6 +48,7 @@ REFUSED_ANGLE = np.radians(15.0)
 then on the wrong axis."""
 TOLD_ANGLE = np.radians(4.0)
 """Turn from which on it is told; compasses and motion capture are aligned within a few degrees."""
+UNTOLD = "the accelerometer feels too little along x and y to tell where they point: drag and wind rest on its mounting"
 LATEST, TOLD_LATE = 0.3, 0.015
 """s of delay that are looked for, and from which on one is told and undone."""
 MOST_JUMPS, MOST_CUT = 5, 0.05
@@ -109,8 +110,27 @@ def _examined(windows: Windows, columns: Columns, late: list[Check]) -> tuple[Ch
     if fault is not None or any(p.left > DISAGREE for p in moving):
         return (*_disagreements(windows, columns, moving, fault), *still)
     found = {c.pair: c for c in (*late, *_small_turns(columns, moving))}
-    agreeing = [Check(p.name, "agrees", p.left) for p in moving if p.name not in found]
+    agreeing = [_agreement(windows, columns, p) for p in moving if p.name not in found]
     return (*found.values(), *agreeing, *still)
+
+
+def _agreement(windows: Windows, columns: Columns, pair: Pair) -> Check:
+    """That a pair agrees. Beside the thrust an accelerometer feels little along x and y, and agrees wherever they are:
+    they are looked at alone. Told where they seem to point elsewhere, or where the flight does not tell it."""
+    if pair.name != FORCE or "specific_force" not in columns:
+        return Check(pair.name, "agrees", pair.left)
+    others: list[tuple[Pair, Fault]] = []
+    for fault in single_faults({"specific_force": columns["specific_force"]}):
+        if fault.axes is not None and fault.axes[2, 2] == 1.0:
+            (mended,) = windows.mended(columns, [pair], fault)
+            others.append((replace(pair, one=mended.one, other=mended.other), fault))
+    best, fault = min(others, key=lambda other: other[0].left)
+    if pair.likelihood(best.left) > SURE:
+        return Check(
+            pair.name, "weak", pair.left, f"{fault.cause}, it seems: drag and wind rest on it", fault.mapping
+        )
+    told = all(other.likelihood(pair.left) > SURE for other, _ in others)
+    return Check(pair.name, "agrees", pair.left, "" if told else UNTOLD)
 
 
 def refusal(checks: tuple[Check, ...]) -> str:
@@ -234,10 +254,12 @@ def _sensor_angle(windows: Windows, columns: Columns, name: str) -> float:
 
 
 def _undelayed(windows: Windows, columns: Columns) -> tuple[Columns, list[Check]]:
-    """The columns without the delay of attitude, then of position and velocity, against the IMU, where it is sure."""
+    """The columns without the delay of attitude, then of position and velocity, against the IMU (without one, against
+    the attitude), where it is sure."""
     out, checks = dict(columns), []
     names = {p.name for p in windows.pairs(columns) if p.moves}
-    for name, shifted in ((ROTATION, ("quaternion",)), (FORCE, _trajectory(columns))):
+    trajectory = _trajectory(columns)
+    for name, shifted in ((ROTATION, ("quaternion",)), (FORCE, trajectory), (TILT, trajectory)):
         late, left = _delay(windows, out, name) if name in names else (0.0, 0.0)
         if abs(late) < TOLD_LATE:
             continue
@@ -245,7 +267,8 @@ def _undelayed(windows: Windows, columns: Columns) -> tuple[Columns, list[Check]
             out[n] = windows.earlier(out[n], late, n == "quaternion")
         what = "the attitude" if name == ROTATION else " and ".join(shifted)
         side = "later" if late > 0 else "earlier"
-        text = f"{what} lagged the IMU: {1e3 * abs(late):.0f} ms {side}, shifted back"
+        against = "attitude" if name == TILT else "IMU"
+        text = f"{what} lagged the {against}: {1e3 * abs(late):.0f} ms {side}, shifted back"
         mapping = "\n".join(f"{n}.late = {late:.3f}" for n in shifted)
         checks.append(Check(name, "undone", left, text, mapping, late=late))
     return out, checks
@@ -275,13 +298,18 @@ def _small_turns(columns: Columns, moving: list[Pair]) -> Iterator[Check]:
             continue
         names: tuple[str, ...] = _trajectory(columns)
         cause = f"the frame of {' and '.join(names)} is turned by {{}} about z against that of the attitude"
-        one, other = pair.other, pair.one
+        right, wrong = pair.other, pair.one
         if pair.name == ROTATION:
             names, cause = ("angular_velocity",), "the gyroscope is turned by {} about the body's z axis"
-            one, other = pair.one, pair.other
-        fault = turned(cause, turn_between(one, other), names, 0)
-        turn = about_z(-fault.angle)[: other.shape[1], : other.shape[1]]
-        left = replace(pair, one=one, other=other @ turn.T).left
+            right, wrong = pair.one, pair.other
+        fault = turned(cause, turn_between(right, wrong), names, 0)
+        turn = about_z(-fault.angle)[: wrong.shape[1], : wrong.shape[1]].T
+        if pair.name == ROTATION:
+            left = replace(pair, other=wrong @ turn).left
+        else:
+            left = replace(
+                pair, one=wrong @ turn, beside=None if pair.beside is None else pair.beside @ turn
+            ).left
         spread = np.sqrt(left * pair.window / (2.0 * pair.seconds))
         if abs(fault.angle) < max(TOLD_ANGLE, 3.0 * spread) or pair.likelihood(left) < SURE:
             continue

@@ -19,6 +19,8 @@ MOVE = 0.5
 """s over which position, velocity and acceleration are compared."""
 TURNS, MOVES, GAINS = 0.05, 0.05, 0.3
 """RMS in rad/s, m/s and m/s² from which on a flight moves enough to know; below, biases and noise decide."""
+MOST_DRAG = 1.0
+"""1/s; what drag takes of a velocity, as an acceleration, at most."""
 ENOUGH = 5.0
 """s of motion without which nothing is said."""
 
@@ -33,7 +35,8 @@ class Pair:
     """Two sides of one motion, (M, k) each, in the same unit.
 
     They last `seconds`, in windows of `window` s. Below an RMS of `weak` they tell nothing (where one side alone moves:
-    below three times that).
+    below three times that). `beside` (M, k) is the velocity where `one` may lack a share of it: drag is no
+    disagreement.
     """
 
     name: str
@@ -42,6 +45,7 @@ class Pair:
     seconds: float
     window: float
     weak: float
+    beside: np.ndarray | None = None
 
     @property
     def moves(self) -> bool:
@@ -55,7 +59,11 @@ class Pair:
     def left(self) -> float:
         """Share of the motion's energy by which the two differ; 0 where they agree, 2 where they are strangers."""
         energy = 0.5 * (np.sum(self.one**2) + np.sum(self.other**2))
-        return float(np.sum((self.one - self.other) ** 2) / max(energy, 1e-12))
+        differ = self.one - self.other
+        if self.beside is not None:
+            drag = -np.sum(differ * self.beside, axis=0) / np.maximum(np.sum(self.beside**2, axis=0), 1e-12)
+            differ = differ + np.clip(drag, 0.0, MOST_DRAG) * self.beside
+        return float(np.sum(differ**2) / max(energy, 1e-12))
 
     def likelihood(self, left: float) -> float:
         """Log likelihood that is gained where only the share `left` stays, every window counted once."""
@@ -108,7 +116,8 @@ class Windows:
             v = slopes(self.t, p)
         if v is not None and q is not None:
             gained = (v[rows + self.move + shift] - v[rows + shift]) / (self.move * self.dt)
-            found.append(self._accelerations(gained, q, columns.get("specific_force"), rows))
+            flown = self.mean(v, np.minimum(rows + shift, len(v) - 1 - self.move), self.move)
+            found.append(self._accelerations(gained, q, columns.get("specific_force"), rows, flown))
         return found
 
     def mended(self, columns: Columns, pairs: list[Pair], fault: Fault) -> list[Pair]:
@@ -150,10 +159,11 @@ class Windows:
         return np.asarray(felt - (np.where([True, True, False], felt.mean(0), 0.0) if len(felt) else 0.0))
 
     def _accelerations(
-        self, gained: np.ndarray, q: np.ndarray, force: np.ndarray | None, rows: np.ndarray
+        self, gained: np.ndarray, q: np.ndarray, force: np.ndarray | None, rows: np.ndarray, flown: np.ndarray
     ) -> Pair:
         """What the velocity gains, and what accelerometer or tilt say; without their horizontal means, for a bias and a
-        steady wind are no disagreement."""
+        steady wind are no disagreement. `flown` (M, 3) is the mean velocity."""
+        beside = None
         if force is not None:
             felt, name = self._felt(self.mean(rotate(q, force), rows, self.move)), FORCE
         else:
@@ -161,9 +171,10 @@ class Windows:
             lean = up[:, :2] / np.where(np.abs(up[:, 2:]) < 0.1, 0.1, up[:, 2:])
             felt = self.mean(lean, rows, self.move) * (gained[:, 2:] + GRAVITY)
             felt, gained = felt - (felt.mean(0) if len(rows) else 0.0), gained[:, :2]
+            beside = flown[:, :2] - (flown[:, :2].mean(0) if len(rows) else 0.0)
             name = TILT
         gained = gained - (gained.mean(0) if len(rows) else 0.0)
-        return self._pair(name, gained, felt, rows, self.move, GAINS)
+        return replace(self._pair(name, gained, felt, rows, self.move, GAINS), beside=beside)
 
     def _pair(
         self, name: str, one: np.ndarray, other: np.ndarray, rows: np.ndarray, width: int, weak: float

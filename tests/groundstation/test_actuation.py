@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from trueflight.groundstation.reading import read_flight
-from trueflight.groundstation.reading.actuation import LIFT, MOTORS, ROTORS, TORQUE, actuation_checks
+from trueflight.groundstation.reading.actuation import BATTERY, LIFT, MOTORS, ROTORS, TORQUE, actuation_checks
 from trueflight.models.flight import COLUMNS, Check, Flight
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -92,3 +92,12 @@ def test_a_hover_says_that_it_cannot_tell(simulated: Flight) -> None:
     level = 0.4 + 0.001 * generator.standard_normal(len(simulated))
     check = checked(simulated, {**good, "specific_force": hover, "thrust_command": level})[LIFT]
     assert check.verdict == "cannot tell"
+
+
+def test_a_voltage_that_rises_with_the_thrust_is_told(simulated: Flight) -> None:
+    good = columns_of(simulated)
+    sagging = 16.0 - 4.0 * good["thrust_command"] - 0.005 * simulated.t
+    assert checked(simulated, {**good, "battery_voltage": sagging})[BATTERY].verdict == "agrees"
+    assert checked(simulated, {**good, "battery_voltage": 32.0 - sagging})[BATTERY].verdict == "weak"
+    stopped = checked(simulated, {**good, "battery_voltage": np.full(len(simulated), 16.0)})[BATTERY]
+    assert stopped.verdict == "cannot tell" and "16.00 V from first to last" in stopped.text
