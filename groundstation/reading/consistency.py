@@ -119,16 +119,22 @@ def _agreement(windows: Windows, columns: Columns, pair: Pair) -> Check:
     they are looked at alone. Told where they seem to point elsewhere, or where the flight does not tell it."""
     if pair.name != FORCE or "specific_force" not in columns:
         return Check(pair.name, "agrees", pair.left)
+    name = "specific_force"
+    faults = [f for f in single_faults({name: columns[name]}) if f.axes is not None and f.axes[2, 2] == 1.0]
+    angle = _sensor_angle(windows, columns, name)
     others: list[tuple[Pair, Fault]] = []
-    for fault in single_faults({"specific_force": columns["specific_force"]}):
-        if fault.axes is not None and fault.axes[2, 2] == 1.0:
-            (mended,) = windows.mended(columns, [pair], fault)
-            others.append((replace(pair, one=mended.one, other=mended.other), fault))
+    for fault in [
+        *faults,
+        turned("the accelerometer is turned by {} about the body's z axis", angle, (name,)),
+    ]:
+        (mended,) = windows.mended(columns, [pair], fault)
+        others.append((replace(pair, one=mended.one, other=mended.other), fault))
     best, fault = min(others, key=lambda other: other[0].left)
-    if pair.likelihood(best.left) > SURE:
-        return Check(
-            pair.name, "weak", pair.left, f"{fault.cause}, it seems: drag and wind rest on it", fault.mapping
-        )
+    small = abs(fault.angle) < TOLD_ANGLE  # NaN is none
+    others = others[:-1]
+    if pair.likelihood(best.left) > SURE and not small:
+        text = f"{fault.cause}, it seems: drag and wind rest on it"
+        return Check(pair.name, "weak", pair.left, text, fault.mapping, fault.angle)
     told = all(other.likelihood(pair.left) > SURE for other, _ in others)
     return Check(pair.name, "agrees", pair.left, "" if told else UNTOLD)
 

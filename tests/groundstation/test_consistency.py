@@ -227,3 +227,35 @@ def test_a_hover_says_that_it_cannot_tell(flight: Flight) -> None:
     still["quaternion"] = np.tile([1.0, 0.0, 0.0, 0.0], (len(flight), 1))
     still["specific_force"] = still["specific_force"] + [0.0, 0.0, 9.81]
     assert {c.verdict for c in looked_at(flight, still).checks} == {"cannot tell"}
+
+
+@pytest.mark.parametrize("degrees", [10, -30, 90, 180])
+def test_an_accelerometer_turned_alone_is_told_with_its_angle(degrees: float) -> None:
+    """By the drag that it feels; its flight agrees with it otherwise, for the thrust has no x and y."""
+    dragged = read_flight(SAMPLES / "rotorpy" / "rotor_drag" / "identify.parquet").part(slice(0, 6000))
+    good = columns_of(dragged)
+    seen = looked_at(dragged, by(about_z(np.radians(degrees)), "specific_force")(good))
+    (check,) = [c for c in seen.checks if c.pair == "velocity and accelerometer"]
+    assert check.verdict == ("weak" if abs(degrees) < 90 else "contradicts") and "accelerometer" in check.text
+    if abs(degrees) < 90:
+        assert "drag and wind rest on it" in check.text
+        assert np.degrees(check.angle) == pytest.approx(degrees, abs=2.0)
+
+
+def test_an_accelerometer_that_feels_nothing_sideways_says_so(flight: Flight) -> None:
+    """No drag is hidden in it."""
+    (check,) = [
+        c for c in looked_at(flight, columns_of(flight)).checks if c.pair == "velocity and accelerometer"
+    ]
+    assert check.verdict == "agrees" and "too little along x and y" in check.text
+
+
+@pytest.mark.parametrize("late", [0.05, 0.1, 0.2])
+def test_a_trajectory_later_than_its_attitude_is_shifted_back_without_an_imu(late: float) -> None:
+    """And the drag, which turns the phase as well, is not taken for a delay."""
+    dragged = read_flight(SAMPLES / "rotorpy" / "rotor_drag" / "identify.parquet").part(slice(0, 6000))
+    good = columns_of(dragged, "angular_velocity", "specific_force")
+    assert not [c for c in looked_at(dragged, good).checks if c.verdict == "undone"]
+    wrong = {n: shifted(dragged.t, good[n], late) for n in ("position", "velocity")}
+    (check,) = [c for c in looked_at(dragged, {**good, **wrong}).checks if c.verdict == "undone"]
+    assert check.late == pytest.approx(late, abs=0.01)
