@@ -6,7 +6,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 SEED ?= 7
 
-.PHONY: setup demo test test-long lint coverage mutation wheel-test bench faults clean docs
+.PHONY: setup demo test test-long lint format coverage mutation wheel-test bench faults clean docs
 
 setup: $(VENV)/.installed
 
@@ -38,6 +38,11 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# What ruff can mend by itself: the order of imports, line breaks.
+format: setup
+	$(BIN)/ruff check --fix-only --quiet .
+	$(BIN)/ruff format .
 
 # sdist and wheel, and the wheel in a new environment beside foreign folders of our names.
 wheel-test: setup

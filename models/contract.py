@@ -6,7 +6,8 @@ import hashlib
 
 CONTRACT_VERSION = "1"
 
-CONTROLLERS = LQR, LQR_INTEGRAL, CORRECTED = ("lqr", "lqr_integral", "corrected")
+LQR, LQR_INTEGRAL, CORRECTED = "lqr", "lqr_integral", "corrected"
+CONTROLLERS = (LQR, LQR_INTEGRAL, CORRECTED)
 """What a mission can be flown with: the cascade, the cascade with an integral, the cascade with its correction."""
 
 INPUT_NAME, OUTPUT_NAME = "features", "delta"

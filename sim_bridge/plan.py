@@ -26,7 +26,7 @@ class Plan:
     """One flight: who flies what, with what hidden. `rate` of the control law in Hz, `model` an ONNX file's
     bytes.
 
-    `controller` is one of `companion.law.controllers.CONTROLLERS`; `corrected` needs a `model`, the others take none.
+    `controller` is one of `models.contract.CONTROLLERS`; `corrected` needs a `model`, the others take none.
     Where it is empty the vehicle flies `corrected` with a model and `lqr` without. For `settle` s the vehicle holds
     the start before the trajectory begins, as the companion does: a correction has faded in by then. The record has
     `rotor_speeds` where the vehicle's speed controllers report them.

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from trueflight.models.contract import CONTROLLERS
+
 # --- flights, and what they are held against ------------------------------------------------------------------------
 
 FlightArgument = Annotated[
@@ -69,4 +71,6 @@ TimeoutOption = Annotated[
 KeysOption = Annotated[
     Path | None, typer.Option("--keys", help="Your folder of `groundstation keys`: TLS, and what you may do.")
 ]
-ControllerOption = Annotated[str, typer.Option(help="lqr, lqr_integral, or corrected by the deployed model.")]
+ControllerOption = Annotated[
+    str, typer.Option(help=f"One of {', '.join(CONTROLLERS)}; corrected needs a deployed model.")
+]

@@ -35,9 +35,14 @@ def assemble(
     accelerometer: bool = True,
 ) -> Flight:
     """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
-    find what was flown. `place(row)` names a row in messages; `most_lost` is the share of samples that gaps may
-    take; `mapping` corrects the columns; `accelerometer` is False where the specific force is an estimator's. Raises
-    `InputError` for anything that cannot be analysed."""
+    find what was flown.
+
+    `place(row)` names a row in messages; `extra` are columns that are kept and not analysed; `flying` (N,) is True
+    where the log says that the vehicle is in the air (without it, that is found out), `commanded` (N,) where these
+    commands flew it; `notes` are told to the user; `most_lost` is the share of samples that gaps may take; `mapping`
+    corrects the columns; `accelerometer` is False where the specific force is an estimator's. Raises `InputError` for
+    anything that cannot be analysed.
+    """
     origin = str(path)
     _check_groups(origin, columns)
     columns, dead = rows.without_dead_battery(columns)

@@ -15,7 +15,8 @@ from trueflight.models.vehicle import Vehicle, load_vehicle
 TABLES = (".csv", ".txt", ".tsv", ".parquet", ".pq")
 RECORDS = (".mcap",)
 ULOGS = (".ulg", ".ulog")
-ENDINGS = (*TABLES, *RECORDS, *ULOGS)
+ENDINGS = (*RECORDS, *TABLES, *ULOGS)
+"""Best first: of files of a folder that differ in their ending only, the first of these is read."""
 
 
 def read_flight(
@@ -37,6 +38,10 @@ def read_flight(
 
 def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Given) -> Flight:
     suffix = path.suffix.lower()
+    if path.is_dir():
+        raise InputError(
+            f"{path}: is a folder; pass one of its flights (`groundstation flights {path}` lists them)"
+        )
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the path (`groundstation flights DIR` lists flights)")
     mappings = read_mappings(mapping)

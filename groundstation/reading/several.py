@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from trueflight.groundstation.reading.flight_file import ENDINGS, RECORDS, TABLES, ULOGS, read_flight
+from trueflight.groundstation.reading.flight_file import ENDINGS, read_flight
 from trueflight.groundstation.reading.mapping import Given
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -77,15 +77,18 @@ def flight_files(folder: Path) -> list[Path]:
 
 def _one_each(folder: Path) -> list[Path]:
     """The flights of a folder, one file each."""
-    best = (*RECORDS, *TABLES, *ULOGS)
     found: dict[Path, Path] = {}
     for file in flight_files(folder):
         known = found.get(file.with_suffix(""))
-        if known is None or best.index(file.suffix.lower()) < best.index(known.suffix.lower()):
+        if known is None or _rank(file) < _rank(known):
             found[file.with_suffix("")] = file
     if not found:
-        raise InputError(f"{folder}: no flights in this folder (known endings: {', '.join(best)})")
+        raise InputError(f"{folder}: no flights in this folder (known endings: {', '.join(ENDINGS)})")
     return list(found.values())
+
+
+def _rank(file: Path) -> int:
+    return ENDINGS.index(file.suffix.lower())
 
 
 def _vehicle_file(flight: Flight) -> Path | None:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
+from trueflight.models.contract import CONTROLLERS
 from trueflight.sim_bridge.settings import Settings, load_settings
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -127,7 +128,10 @@ class Flying:
         Path | None, typer.Option(help="ONNX model; the guarded correction then flies with it.")
     ] = None
     controller: Annotated[
-        str, typer.Option(help="lqr, lqr_integral, corrected; corrected where a model is given.")
+        str,
+        typer.Option(
+            help=f"One of {', '.join(CONTROLLERS)}; without it corrected where a model is given, otherwise lqr."
+        ),
     ] = ""
     trim: Annotated[
         float | None,

@@ -41,10 +41,10 @@ class TruthEffect:
     units: ClassVar[dict[str, str]]
     least: float = 0.0
     most: float = math.inf
-    drawn: bool = True
-    """Whether `random` may draw it."""
-    any_draws: bool | None = None
-    """Whether `any` may draw it; None: as `random` does."""
+    drawn: bool = False
+    """Whether `random` and `any` draw it: the first ten, so that a seed hides for ever what it hid."""
+    any_draws: bool = False
+    """Whether `any` draws it, though `random` does not: for one that shows in every flight."""
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """All parameters, drawn, or around a given size."""

@@ -70,7 +70,7 @@ def pool(request: str) -> list[str]:
     """Names of the effects that `random` or `any` draws from."""
     if request == "random":
         return [name for name, effect in EFFECTS.items() if effect.drawn]
-    return [n for n, e in EFFECTS.items() if (e.drawn if e.any_draws is None else e.any_draws)]
+    return [name for name, effect in EFFECTS.items() if effect.drawn or effect.any_draws]
 
 
 def choose(

@@ -8,6 +8,8 @@ import pytest
 
 from trueflight.groundstation.commands.app import app
 from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.reading.flight_file import ENDINGS
+from trueflight.groundstation.reading.several import flights_in
 from trueflight.groundstation.reading.writing import own_table
 from trueflight.models.errors import run_command_line
 
@@ -307,3 +309,11 @@ def test_a_folder_with_a_bad_flight_lists_the_others(table, tmp_path, capsys):
     assert "is empty" in rows["bad.csv"]["error"]
     assert rows["good.csv"]["error"] == "" and rows["good.csv"]["duration"] > 11
     assert "no such folder" in refused(["flights", tmp_path / "nowhere"], capsys)
+    assert "is a folder; pass one of its flights" in refused(["diagnose", tmp_path], capsys)
+
+
+def test_of_files_that_differ_in_their_ending_only_one_is_read(tmp_path):
+    for ending in ENDINGS:
+        (tmp_path / f"one{ending}").touch()
+    (tmp_path / f"two{ENDINGS[-1]}").touch()
+    assert flights_in([tmp_path]) == [tmp_path / f"one{ENDINGS[0]}", tmp_path / f"two{ENDINGS[-1]}"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import random
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,6 +51,12 @@ def added(vehicle: Vehicle, hidden: Hidden, seed: int):
     force, torque = wrench_of(airframe_with(vehicle, hidden), position, velocity, commands)
     plain_force, plain_torque = wrench_of(airframe_with(vehicle), position, velocity, commands)
     return force - plain_force, torque - plain_torque, position, velocity, commands, rotation
+
+
+def test_every_hidden_effect_is_tested() -> None:
+    tests = "".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
+    untested = {name for name in EFFECTS if f'Hidden("{name}"' not in tests}
+    assert not untested, "hold its forces against plain vector algebra"
 
 
 @pytest.mark.parametrize("seed", STATES)

@@ -18,6 +18,7 @@ class AccelerometerBias(TruthEffect):
     name = "accelerometer_bias"
     what = "the accelerometer reads a constant off, in body axes"
     low, high, most = 0.2, 0.5, 0.3 * GRAVITY
+    drawn = True
     units: ClassVar = {"size": "m/s^2", "x": "m/s^2", "y": "m/s^2", "z": "m/s^2"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

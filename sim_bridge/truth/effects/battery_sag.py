@@ -15,6 +15,7 @@ class BatterySag(TruthEffect):
     name = "battery_sag"
     what = "thrust follows a power of the battery's voltage over the nominal one"
     low, high, least, most = 0.9, 2.0, -4.0, 4.0
+    drawn = True
     units: ClassVar = {"exponent": "1"}
 
     def attach(

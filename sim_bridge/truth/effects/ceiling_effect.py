@@ -20,7 +20,7 @@ class CeilingEffect(TruthEffect):
 
     name = "ceiling_effect"
     what = "each rotor's thrust rises near a ceiling above the flight"
-    low, high, most, drawn, any_draws = 2.0, 3.0, 6.0, False, False
+    low, high, most = 2.0, 3.0, 6.0
     units: ClassVar = {"radius_factor": "1", "height": "m"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

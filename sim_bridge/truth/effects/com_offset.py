@@ -17,7 +17,7 @@ class CentreOfMassOffset(TruthEffect):
 
     name = "com_offset"
     what = "the centre of mass is off the rotors' centre, so that thrust turns the vehicle"
-    low, high, most, drawn, any_draws = 0.004, 0.010, 0.2, False, True
+    low, high, most, any_draws = 0.004, 0.010, 0.2, True
     units: ClassVar = {"distance": "m", "x": "m", "y": "m"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

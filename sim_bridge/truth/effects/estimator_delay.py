@@ -21,7 +21,7 @@ class EstimatorDelay(TruthEffect):
 
     name = "estimator_delay"
     what = "a companion is told of every moment this much later, to whole 2 ms"
-    low, high, most, drawn = 0.006, 0.014, 0.2, False
+    low, high, most = 0.006, 0.014, 0.2
     units: ClassVar = {"delay": "s"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

@@ -23,6 +23,7 @@ class GroundEffect(TruthEffect):
     name = "ground_effect"
     what = "each rotor's thrust rises near the ground, by the images of all four"
     low, high, most = 1.2, 2.0, 6.0
+    drawn = True
     units: ClassVar = {"radius_factor": "1"}
 
     def attach(

@@ -19,7 +19,7 @@ class Gyroscopic(TruthEffect):
 
     name = "gyroscopic"
     what = "the rotors' angular momentum couples roll and pitch, and their spin-up turns the body"
-    low, high, most, drawn, any_draws = 1.5e-5, 4e-5, 1.0, False, False
+    low, high, most = 1.5e-5, 4e-5, 1.0
     units: ClassVar = {"inertia": "kg m^2"}
 
     def scale(self, vehicle: Vehicle) -> float:

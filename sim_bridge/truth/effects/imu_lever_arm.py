@@ -17,7 +17,7 @@ class ImuLeverArm(TruthEffect):
 
     name = "imu_lever_arm"
     what = "the accelerometer sits away from the centre of mass"
-    low, high, most, drawn, any_draws = 0.03, 0.07, 0.5, False, True
+    low, high, most, any_draws = 0.03, 0.07, 0.5, True
     units: ClassVar = {"length": "m", "x": "m", "y": "m", "z": "m"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

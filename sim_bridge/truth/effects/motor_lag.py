@@ -17,6 +17,7 @@ class MotorLag(TruthEffect):
     name = "motor_lag"
     what = "the rotors' speed lags its command with another time constant"
     low, high, least, most = 0.045, 0.058, 0.0, 1.0
+    drawn = True
     units: ClassVar = {"time_constant": "s"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

@@ -18,7 +18,7 @@ class Payload(TruthEffect):
 
     name = "payload"
     what = "a share of the vehicle's mass is picked up at a time after take-off"
-    low, high, most, drawn = 0.08, 0.15, 1.0, False
+    low, high, most = 0.08, 0.15, 1.0
     units: ClassVar = {"mass_fraction": "1", "time": "s"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

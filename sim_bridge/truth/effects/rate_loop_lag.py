@@ -15,7 +15,7 @@ class RateLoopLag(TruthEffect):
 
     name = "rate_loop_lag"
     what = "body rates follow their command through a further lag"
-    low, high, most, drawn, any_draws = 0.06, 0.09, 1.0, False, True
+    low, high, most, any_draws = 0.06, 0.09, 1.0, True
     units: ClassVar = {"time_constant": "s"}
 
     def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:

@@ -16,6 +16,7 @@ class ThrustCurve(TruthEffect):
     name = "thrust_curve"
     what = "the map from command to rotor speed is another curve, right at hover only"
     low, high, least, most = 0.35, 0.9, -0.5, 1.5
+    drawn = True
     units: ClassVar = {"speed_blend": "1"}
 
     def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:

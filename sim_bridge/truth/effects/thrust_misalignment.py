@@ -18,7 +18,7 @@ class ThrustMisalignment(TruthEffect):
 
     name = "thrust_misalignment"
     what = "every rotor's axis leans by the same angle against the body"
-    low, high, most, drawn, any_draws = 0.02, 0.05, 0.3, False, True
+    low, high, most, any_draws = 0.02, 0.05, 0.3, True
     units: ClassVar = {"angle": "rad", "x": "rad", "y": "rad"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

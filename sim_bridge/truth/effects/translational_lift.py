@@ -19,7 +19,7 @@ class TranslationalLift(TruthEffect):
 
     name = "translational_lift"
     what = "each rotor's thrust rises with the square of the airspeed in its plane"
-    low, high, most, drawn, any_draws = 0.03, 0.08, 0.5, False, True
+    low, high, most, any_draws = 0.03, 0.08, 0.5, True
     units: ClassVar = {"lift": "1/m"}
 
     def attach(

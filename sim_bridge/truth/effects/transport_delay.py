@@ -16,6 +16,7 @@ class TransportDelay(TruthEffect):
     name = "transport_delay"
     what = "setpoints reach the motors later than believed, by this much more"
     low, high, least, most = 0.018, 0.036, 0.0, 0.5
+    drawn = True
     units: ClassVar = {"extra_delay": "s"}
 
     def powertrain(self, train: Powertrain, vehicle: Vehicle, numbers: dict[str, float]) -> Powertrain:

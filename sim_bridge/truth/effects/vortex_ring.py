@@ -20,7 +20,7 @@ class VortexRing(TruthEffect):
 
     name = "vortex_ring"
     what = "each rotor loses thrust where it sinks nearly as fast as its own wake"
-    low, high, most, drawn, any_draws = 0.15, 0.35, 0.8, False, False
+    low, high, most = 0.15, 0.35, 0.8
     units: ClassVar = {"loss": "1"}
 
     def attach(
