@@ -51,6 +51,8 @@ TOLD_ANGLE = np.radians(4.0)
 UNTOLD = "the accelerometer feels too little along x and y to tell where they point: drag and wind rest on its mounting"
 LATEST, TOLD_LATE = 0.3, 0.015
 """s of delay that are looked for, and from which on one is told and undone."""
+STEPS = (0.005, 0.02)
+"""s by which delays are tried in the end, and at first: windows of half a second know no narrower valley."""
 MOST_JUMPS, MOST_CUT = 5, 0.05
 """Jumps of the heading, and share of the flight, beyond which what looks like steps is disagreement throughout."""
 
@@ -282,12 +284,18 @@ def _undelayed(windows: Windows, columns: Columns) -> tuple[Columns, list[Check]
 
 def _delay(windows: Windows, columns: Columns, name: str) -> tuple[float, float]:
     """How late (s) attitude or trajectory is against the IMU, and the share left then; 0 where it is not sure."""
-    step = max(1, round(0.005 / windows.dt))
+    step, coarse = (max(1, round(seconds / windows.dt)) for seconds in STEPS)
     reach = int(LATEST / windows.dt) // step * step
-    shifts = np.arange(-reach, reach + 1, step)
-    pairs = [next(p for p in windows.pairs(columns, int(shift), reach) if p.name == name) for shift in shifts]
-    left = np.array([p.left for p in pairs])
-    here, best = pairs[reach // step], int(np.argmin(left))
+    here = windows.pair(name, columns, 0, reach)
+
+    def left_at(shifts: np.ndarray) -> np.ndarray:
+        return np.array([windows.later(here, columns, int(shift), reach).left for shift in shifts])
+
+    rough = np.arange(-reach, reach + 1, coarse)
+    near = int(rough[np.argmin(left_at(rough))])
+    shifts = np.arange(max(near - coarse, -reach), min(near + coarse, reach) + 1, step)
+    left = left_at(shifts)
+    best = int(np.argmin(left))
     if not here.moves or best in (0, len(left) - 1):
         return 0.0, here.left
     if here.likelihood(left[best]) < SURE or left[best] > 0.5 * here.left:

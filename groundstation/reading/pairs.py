@@ -86,7 +86,11 @@ class Windows:
         moving = [3.0 / rate for rate in (rates or {}).values()]
         self.turn = max(1, round(max(TURN, *turning, 0.0) / self.dt))
         self.move = max(1, round(max(MOVE, *moving, 0.0) / self.dt))
-        self._turned: tuple[tuple[int, int], np.ndarray] = ((0, 0), np.empty(0))
+        self._turned = (
+            np.empty(0),
+            np.empty(0),
+            np.empty(0),
+        )  # attitude, accelerometer, and what was made of them
 
     def rows(self, width: int, reach: int = 0) -> np.ndarray:
         """First rows of windows of `width` samples in the air, with `reach` more on either side, a quarter apart."""
@@ -96,29 +100,49 @@ class Windows:
         rows = rows[ground[rows + width + 1] == ground[rows]]
         return rows[:: max(1, width // 4)]
 
-    def pairs(self, columns: Columns, shift: int = 0, reach: int = 0) -> list[Pair]:
-        """The pairs that the columns allow.
+    def pairs(self, columns: Columns) -> list[Pair]:
+        """The pairs that the columns allow."""
+        return [self.pair(name, columns) for name in _possible(columns)]
 
-        Attitude and trajectory are read `shift` samples (at most `reach`) later than the gyroscope and accelerometer.
+    def pair(self, name: str, columns: Columns, shift: int = 0, reach: int = 0) -> Pair:
+        """One pair, which the columns allow.
+
+        Attitude and trajectory are read `shift` samples (at most `reach`) later than gyroscope and accelerometer;
+        without these the trajectory later than the attitude.
         """
-        found = []
-        q, w = columns.get("quaternion"), columns.get("angular_velocity")
-        p, v = columns.get("position"), columns.get("velocity")
-        if q is not None and w is not None:
-            rows = self.rows(self.turn, reach)
-            turned = body_rate(q[rows + shift], q[rows + self.turn + shift], self.turn * self.dt)
-            found.append(self._pair(ROTATION, turned, self.mean(w, rows, self.turn), rows, self.turn, TURNS))
-        rows = self.rows(self.move, reach)
-        if p is not None and v is not None:
-            moved = (p[rows + self.move + shift] - p[rows + shift]) / (self.move * self.dt)
-            found.append(self._pair(MOTION, moved, self.mean(v, rows, self.move), rows, self.move, MOVES))
-        if v is None and p is not None:
-            v = slopes(self.t, p)
-        if v is not None and q is not None:
-            gained = (v[rows + self.move + shift] - v[rows + shift]) / (self.move * self.dt)
-            flown = self.mean(v, np.minimum(rows + shift, len(v) - 1 - self.move), self.move)
-            found.append(self._accelerations(gained, q, columns.get("specific_force"), rows, flown))
-        return found
+        width = self.turn if name == ROTATION else self.move
+        rows = self.rows(width, reach)
+        one = self._moved(name, columns, rows + shift)
+        if name == ROTATION:
+            return self._pair(
+                name, one, self.mean(columns["angular_velocity"], rows, width), rows, width, TURNS
+            )
+        if name == MOTION:
+            return self._pair(name, one, self.mean(columns["velocity"], rows, width), rows, width, MOVES)
+        if name == FORCE:
+            felt = rotate(columns["quaternion"], columns["specific_force"])
+            return self._pair(name, one, self._felt(self.mean(felt, rows, width)), rows, width, GAINS)
+        return self._tilted(one, columns, rows, shift)
+
+    def later(self, pair: Pair, columns: Columns, shift: int, reach: int) -> Pair:
+        """A pair that was made with this `reach`, with another `shift`."""
+        if pair.name == TILT:
+            return self.pair(pair.name, columns, shift, reach)
+        rows = self.rows(self.turn if pair.name == ROTATION else self.move, reach)
+        return replace(pair, one=self._moved(pair.name, columns, rows + shift))
+
+    def _moved(self, name: str, columns: Columns, rows: np.ndarray) -> np.ndarray:
+        """What attitude or trajectory did in the windows from `rows` on: turned (rad/s), moved (m/s), or gained (m/s²,
+        without its mean, for a bias and a steady wind are no disagreement)."""
+        if name == ROTATION:
+            q = columns["quaternion"]
+            return body_rate(q[rows], q[rows + self.turn], self.turn * self.dt)
+        moved = columns["position"] if name == MOTION else self._velocity(columns)
+        change = (moved[rows + self.move] - moved[rows]) / (self.move * self.dt)
+        return change if name == MOTION or not len(rows) else np.asarray(change - change.mean(0))
+
+    def _velocity(self, columns: Columns) -> np.ndarray:
+        return columns["velocity"] if "velocity" in columns else slopes(self.t, columns["position"])
 
     def mended(self, columns: Columns, pairs: list[Pair], fault: Fault) -> list[Pair]:
         """`pairs` of these columns as they would be without the `fault`; quick where vectors stand in other axes."""
@@ -144,37 +168,30 @@ class Windows:
 
     def _turned_force(self, columns: Columns) -> np.ndarray:
         """Mean over each window of each element of the rotation times each axis of the accelerometer, (M, 3, 3, 3)."""
-        key = (id(columns["quaternion"]), id(columns["specific_force"]))
-        if self._turned[0] != key:
-            q, f = columns["quaternion"], columns["specific_force"]
+        q, f = columns["quaternion"], columns["specific_force"]
+        if self._turned[0] is not q or self._turned[1] is not f:
             axes = np.stack([rotate(q, np.tile(axis, (len(q), 1))) for axis in np.eye(3)], -1)
             every = (axes[:, :, :, None] * f[:, None, None, :]).reshape(len(q), 27)
             rows = self.rows(self.move)
-            self._turned = (key, self.mean(every, rows, self.move).reshape(len(rows), 3, 3, 3))
-        return self._turned[1]
+            self._turned = (q, f, self.mean(every, rows, self.move).reshape(len(rows), 3, 3, 3))
+        return self._turned[2]
 
     def _felt(self, force: np.ndarray) -> np.ndarray:
         """The acceleration (M, 3) that a specific force in the world tells, without its horizontal mean."""
         felt = force - [0.0, 0.0, GRAVITY]
         return np.asarray(felt - (np.where([True, True, False], felt.mean(0), 0.0) if len(felt) else 0.0))
 
-    def _accelerations(
-        self, gained: np.ndarray, q: np.ndarray, force: np.ndarray | None, rows: np.ndarray, flown: np.ndarray
-    ) -> Pair:
-        """What the velocity gains, and what accelerometer or tilt say; without their horizontal means, for a bias and a
-        steady wind are no disagreement. `flown` (M, 3) is the mean velocity."""
-        beside = None
-        if force is not None:
-            felt, name = self._felt(self.mean(rotate(q, force), rows, self.move)), FORCE
-        else:
-            up = rotate(q, np.tile([0.0, 0.0, 1.0], (len(q), 1)))
-            lean = up[:, :2] / np.where(np.abs(up[:, 2:]) < 0.1, 0.1, up[:, 2:])
-            felt = self.mean(lean, rows, self.move) * (gained[:, 2:] + GRAVITY)
-            felt, gained = felt - (felt.mean(0) if len(rows) else 0.0), gained[:, :2]
-            beside = flown[:, :2] - (flown[:, :2].mean(0) if len(rows) else 0.0)
-            name = TILT
-        gained = gained - (gained.mean(0) if len(rows) else 0.0)
-        return replace(self._pair(name, gained, felt, rows, self.move, GAINS), beside=beside)
+    def _tilted(self, gained: np.ndarray, columns: Columns, rows: np.ndarray, shift: int) -> Pair:
+        """What the velocity gains along the horizontal, and what a thrust along the body's z that carries the vehicle
+        gives there, with the velocity beside."""
+        q, velocity = columns["quaternion"], self._velocity(columns)
+        up = rotate(q, np.tile([0.0, 0.0, 1.0], (len(q), 1)))
+        lean = up[:, :2] / np.where(np.abs(up[:, 2:]) < 0.1, 0.1, up[:, 2:])
+        felt = self.mean(lean, rows, self.move) * (gained[:, 2:] + GRAVITY)
+        flown = self.mean(velocity, rows + shift, self.move)[:, :2]
+        centre = (lambda a: a - a.mean(0)) if len(rows) else (lambda a: a)
+        pair = self._pair(TILT, gained[:, :2], centre(felt), rows, self.move, GAINS)
+        return replace(pair, beside=centre(flown))
 
     def _pair(
         self, name: str, one: np.ndarray, other: np.ndarray, rows: np.ndarray, width: int, weak: float
@@ -196,6 +213,19 @@ class Windows:
             clock = self.t[part]
             out[part] = np.stack([np.interp(clock + late, clock, axis) for axis in source[part].T], -1)
         return out / np.linalg.norm(out, axis=1, keepdims=True) if unit_quaternion else out
+
+
+def _possible(columns: Columns) -> list[str]:
+    """Names of the pairs that the columns allow."""
+    has = set(columns)
+    names = []
+    if {"quaternion", "angular_velocity"} <= has:
+        names.append(ROTATION)
+    if {"position", "velocity"} <= has:
+        names.append(MOTION)
+    if "quaternion" in has and has & {"position", "velocity"}:
+        names.append(FORCE if "specific_force" in has else TILT)
+    return names
 
 
 def _rms(values: np.ndarray) -> float:
