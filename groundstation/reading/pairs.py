@@ -86,11 +86,12 @@ class Windows:
         moving = [3.0 / rate for rate in (rates or {}).values()]
         self.turn = max(1, round(max(TURN, *turning, 0.0) / self.dt))
         self.move = max(1, round(max(MOVE, *moving, 0.0) / self.dt))
-        self._turned = (
-            np.empty(0),
-            np.empty(0),
-            np.empty(0),
-        )  # attitude, accelerometer, and what was made of them
+        no = np.empty(0)
+        self._turned: tuple[np.ndarray, np.ndarray, np.ndarray] = (
+            no,
+            no,
+            no,
+        )  # attitude, force, and what became of them
 
     def rows(self, width: int, reach: int = 0) -> np.ndarray:
         """First rows of windows of `width` samples in the air, with `reach` more on either side, a quarter apart."""
