@@ -7,6 +7,7 @@ import typer
 from trueflight.groundstation.commands import (
     bound,
     calibrate,
+    choosing,
     collect,
     compare,
     demo,
@@ -59,6 +60,7 @@ remainder.register(app)
 plan.register(app)
 survey.register(app)
 calibrate.register(app)
+choosing.offer_sources(app)
 
 
 def main() -> None:

@@ -8,7 +8,13 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from trueflight.groundstation.commands.options import DesignOption, JsonOption, SaveOption, VehicleOption
+from trueflight.groundstation.commands.options import (
+    DesignOption,
+    JsonOption,
+    MappingOption,
+    SaveOption,
+    VehicleOption,
+)
 from trueflight.groundstation.output.terminal import print_notes, print_written
 from trueflight.models.printed import print_json
 
@@ -24,6 +30,7 @@ def track_command(
     flights: Annotated[list[Path], typer.Argument(help="One flight or more, usually before and after.")],
     design: DesignOption = None,
     vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
     rrd: SaveOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -32,7 +39,7 @@ def track_command(
     from trueflight.groundstation.output.as_json import tracked_table
     from trueflight.groundstation.output.flown import print_tracking
 
-    tracked = told_apart([track_file(path, design, vehicle) for path in flights])
+    tracked = told_apart([track_file(path, design, vehicle, mapping) for path in flights])
     if rrd is not None:
         from trueflight.groundstation.views import write_tracking
 

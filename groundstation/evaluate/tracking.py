@@ -11,6 +11,8 @@ import numpy as np
 
 from trueflight.groundstation.design.linear_response import Reference, expected_behaviour
 from trueflight.groundstation.reading import read_flight, segments
+from trueflight.groundstation.reading.mapping import Given
+from trueflight.groundstation.reading.ros_bag import is_ros_bag
 from trueflight.models.design import Design, load_design
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -45,15 +47,15 @@ class Tracking:
 
 
 def read_designed(
-    path: Path, design: Path | None = None, vehicle: Path | None = None
+    path: Path, design: Path | None = None, vehicle: Path | None = None, mapping: Given = None
 ) -> tuple[Flight, Design, str]:
     """A flight, the design it is measured against (that of the record unless given) and its label.
 
     Raises `InputError`.
     """
     label = path.stem
-    flight = read_flight(path, vehicle)
-    if path.suffix.lower() == ".mcap":
+    flight = read_flight(path, vehicle, mapping)
+    if path.suffix.lower() == ".mcap" and not is_ros_bag(path):
         from trueflight.models.record import read_record
 
         record = read_record(path)
@@ -68,9 +70,11 @@ def read_designed(
     return flight, load_design(design, flight.vehicle), label
 
 
-def track_file(path: Path, design: Path | None = None, vehicle: Path | None = None) -> Tracking:
+def track_file(
+    path: Path, design: Path | None = None, vehicle: Path | None = None, mapping: Given = None
+) -> Tracking:
     """Read a flight and track it; the design is that of the record unless given. Raises `InputError`."""
-    return track(*read_designed(path, design, vehicle))
+    return track(*read_designed(path, design, vehicle, mapping))
 
 
 def told_apart(tracked: Sequence[Tracking]) -> list[Tracking]:

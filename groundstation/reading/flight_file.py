@@ -6,6 +6,7 @@ from pathlib import Path
 
 from trueflight.groundstation.reading.assemble import assemble
 from trueflight.groundstation.reading.mapping import Given, apply_mapping, load_mapping, merged, read_mappings
+from trueflight.groundstation.reading.sources import Sources, refuse_topics
 from trueflight.groundstation.reading.table import Table, own_columns, read_table, unknown_columns
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -45,22 +46,29 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Give
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the path (`groundstation flights DIR` lists flights)")
     mappings = read_mappings(mapping)
-    corrections = merged([one for one in mappings if not one.names_columns])
+    beside = None if suffix in TABLES else _beside(path, "mapping.toml")
+    if beside is not None and not mappings:
+        mappings = (load_mapping(beside),)
+    every = merged(mappings)
+    sources = Sources() if every is None else every.sources
+    corrections = merged([one for one in mappings if one.corrects and not one.names_columns])
     if suffix in RECORDS:
         from trueflight.groundstation.reading.flight_record import read_flight_record
         from trueflight.groundstation.reading.px4_flight import flight_of
         from trueflight.groundstation.reading.ros_bag import is_ros_bag, load_ros_bag
 
         if is_ros_bag(path):
-            return flight_of(path, load_ros_bag(path), _vehicle(path, vehicle), corrections)
+            return flight_of(path, load_ros_bag(path, sources), _vehicle(path, vehicle), corrections)
 
+        refuse_topics(sources, path)
         return read_flight_record(path, vehicle, corrections)
     if suffix in ULOGS:
         from trueflight.groundstation.reading.ulog import read_ulog
 
-        return read_ulog(path, _vehicle(path, vehicle), corrections)
+        return read_ulog(path, _vehicle(path, vehicle), corrections, sources)
     if suffix not in TABLES:
         raise InputError(f"{path}: '{suffix}' is no kind of flight file; known are {', '.join(ENDINGS)}")
+    refuse_topics(sources, path)
     table = read_table(path)
     believed = _vehicle(path, vehicle)
     beside = _mapping_beside(path, table)

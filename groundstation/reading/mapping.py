@@ -30,20 +30,22 @@ mended by
 * `late = 0.1`: the values come so many seconds after what they tell, and are shifted back.
 
 A mapping without the column of `[time]` names none: it corrects what is read already, from a table in the project's
-own names or from a log. One key of it is a line that a command takes as it is: `--mapping 'velocity.turned = 20'`.
+own names or from a log. Which topics of a log are read, `reading.sources` tells. One key of it is a line that a command
+takes as it is: `--mapping 'velocity.turned = 20'`.
 """
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeGuard
 
 import numpy as np
 
 from trueflight.groundstation.reading.faults import about_z
+from trueflight.groundstation.reading.sources import Sources, sources_in
 from trueflight.groundstation.reading.table import Table
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS
@@ -97,11 +99,17 @@ _SPECIAL = {"time": "s", "attitude": "rad", "world_acceleration": "m/s^2"}
 @dataclass(frozen=True)
 class Mapping:
     """A mapping as read: `quantities` by name, each with the keys of its table; `frame` of the file, '' where it names
-    none."""
+    none; `sources` are the topics that it chooses."""
 
     source: str
     frame: str
     quantities: dict[str, dict[str, object]]
+    sources: Sources = field(default_factory=Sources)
+
+    @property
+    def corrects(self) -> bool:
+        """Whether it says anything of a quantity."""
+        return bool(self.frame or self.quantities)
 
     @property
     def names_columns(self) -> bool:
@@ -114,7 +122,8 @@ class Mapping:
             return self
         names = [*other.quantities, *(name for name in self.quantities if name not in other.quantities)]
         merged = {n: {**other.quantities.get(n, {}), **self.quantities.get(n, {})} for n in names}
-        return Mapping(f"{other.source}, {self.source}", self.frame or other.frame, merged)
+        sources = self.sources.over(other.sources)
+        return Mapping(f"{other.source}, {self.source}", self.frame or other.frame, merged, sources)
 
 
 @dataclass(frozen=True)
@@ -162,7 +171,7 @@ def load_mapping(given: str | Path) -> Mapping:
         table = toml_table(given, source, "a line is like velocity.turned = 20")
     else:
         source, table = str(given), read_toml(Path(given), "the mapping")
-    frame = table.pop("frame", "")
+    sources, frame = sources_in(table, source), table.pop("frame", "")
     if frame != "":
         _one_of(source, "frame", frame, FRAMES)
     known = [*COLUMNS, *_SPECIAL]
@@ -185,7 +194,7 @@ def load_mapping(given: str | Path) -> Mapping:
                 raise InputError(f"{source}: [{name}] has an unknown key '{key}'; {hint}")
         _one_of(source, f"[{name}] frame", entry.get("frame", FRAMES[0]), FRAMES)
         quantities[name] = entry
-    return Mapping(source, str(frame), quantities)
+    return Mapping(source, str(frame), quantities, sources)
 
 
 def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTable:

@@ -41,8 +41,12 @@ def airborne(log: Log) -> tuple[Airborne, list[str]]:
     """The clock over what was armed plus 2 s on both sides, and what was flown on it. Raises `InputError` for a log
     without a flight."""
     origin = log.origin
-    names = ("vehicle_attitude", "vehicle_odometry", "sensor_combined")
-    needed = [topic for name in names if (topic := log.topic(name)) is not None]
+    names = (
+        ("quaternion", "vehicle_attitude"),
+        ("quaternion", "vehicle_odometry"),
+        ("specific_force", "sensor_combined"),
+    )
+    needed = [topic for what, name in names if (topic := log.of(what).topic(name)) is not None]
     if not needed:
         raise InputError(
             f"{origin}: neither vehicle_attitude nor sensor_combined is in the log (cut short?); {log.advice}"
@@ -129,9 +133,15 @@ def motor_count(log: Log) -> int:
     return MOTORS.get(int(kind), 4)
 
 
-def battery_in_use(log: Log, air: Airborne) -> Topic | None:
-    """The battery that flew: connected, with a voltage, and of several the one that gave the most current."""
-    best, most = None, -1.0
+DRAWN, AGREE = 1.5, 0.03
+"""Times the current of the next battery from which on one is the flight battery; share by which voltages of one may
+differ."""
+
+
+def battery_in_use(log: Log, air: Airborne) -> tuple[Topic | None, list[str]]:
+    """The battery that flew: connected, with a voltage, and of several the one that gave the most current; and what to
+    say of the others. None where nothing tells which of several it was."""
+    found: list[tuple[float, float, Topic]] = []
     first, last = air.span
     for battery in log.topics.get("battery_status", ()):
         flown = (battery.t >= first) & (battery.t <= last)
@@ -143,9 +153,26 @@ def battery_in_use(log: Log, air: Airborne) -> Topic | None:
             continue
         current = np.asarray(battery.fields.get("current_a", np.zeros(len(battery.t))), dtype=float)[flown]
         drawn = max(float(np.nanmedian(current)) if np.any(np.isfinite(current)) else 0.0, 0.0)
-        if drawn > most:
-            best, most = battery, drawn
-    return best
+        found.append((drawn, float(np.median(voltage)), battery))
+    if len(found) < 2:
+        return (found[0][2] if found else None), []
+    found.sort(key=lambda one: (-one[0], one[2].instance))
+    (most, volts, best), (less, _, next_) = found[:2]
+    named = [f"battery_status:{battery.instance}" for _, _, battery in found]
+    told = ", ".join(f"{name} {v:.3g} V" for name, (_, v, _) in zip(named, found, strict=True))
+    if most > max(DRAWN * less, 0.1):
+        why = "it gives the most current"
+    elif max(abs(v - volts) for _, v, _ in found) <= AGREE * volts:
+        why = "their voltages agree"
+    else:
+        line = f"--topic battery_voltage={named[0]} takes one"
+        return None, [
+            f"{len(found)} batteries, and no current tells which of them flies ({told}): voltage is left out; {line}"
+        ]
+    return best, [
+        f"{len(found)} batteries ({told}): {named[0]} is read, {why}; --topic battery_voltage="
+        f"battery_status:{next_.instance} reads another"
+    ]
 
 
 def ground_level(height: np.ndarray, air: Airborne) -> tuple[np.ndarray, list[str]]:

@@ -60,7 +60,7 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle, mapping: Mapping | None = 
     notes = [*_heading(log, air), *log.notes, *notes]
     lost: list[Topic] = []
     columns: dict[str, np.ndarray] = {}
-    attitude, said = attitude_of(log, air)
+    attitude, said = attitude_of(log.of("quaternion"), air)
     columns["quaternion"] = attitude
     notes += said
     motion, usable, said = motion_of(log, air, attitude)
@@ -78,11 +78,12 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle, mapping: Mapping | None = 
     commands, said = _commands(log, air, vehicle)
     columns |= commands
     notes += said
-    if (battery := battery_in_use(log, air)) is not None:
+    battery, said = battery_in_use(log.of("battery_voltage"), air)
+    notes += said
+    if battery is not None:
         columns["battery_voltage"] = np.interp(air.clock, battery.t, battery.fields["voltage_v"])
-    lost += [
-        t for name in ("vehicle_attitude", "vehicle_local_position") if (t := log.topic(name)) is not None
-    ]
+    estimates = (("quaternion", "vehicle_attitude"), ("position", "vehicle_local_position"))
+    lost += [t for quantity, name in estimates if (t := log.of(quantity).topic(name)) is not None]
     recorded = _recorded(air.clock, lost)
     if not np.all(recorded[air.armed]):
         notes.append(f"{(~recorded & air.armed).sum() / RATE:.1f} s of the armed time were not recorded")
@@ -139,22 +140,30 @@ def _inertial(log: Log, air: Airborne) -> tuple[dict[str, np.ndarray], list[Topi
     notes: list[str] = []
     first, last = air.span
 
-    def fast(name: str, *fields: str) -> Topic | None:
-        topic = log.topic(name, *fields)
-        return topic if topic is not None and topic.rate_within(first, last) >= FAST else None
+    def fast(quantity: str, name: str, *fields: str) -> Topic | None:
+        topic = log.of(quantity).topic(name, *fields)
+        if topic is None or (rate := topic.rate_within(first, last)) >= FAST:
+            return topic
+        if quantity in log.chosen:
+            raise InputError(
+                f"{log.origin}: {topic.name}, chosen for {quantity}, was logged at {rate:.0f} Hz, and {FAST:.0f} Hz "
+                "are needed; choose another topic (--topic)"
+            )
+        return None
 
-    if (raw := fast("sensor_combined", *ACCELEROMETER)) is not None:
+    if (raw := fast("specific_force", "sensor_combined", *ACCELEROMETER)) is not None:
         out["specific_force"] = flu_from_frd(period_mean(raw.t, raw.stack(*ACCELEROMETER), air.clock))
         used.append(raw)
-    elif (filtered := fast("vehicle_acceleration", *XYZ)) is not None:
+    elif (filtered := fast("specific_force", "vehicle_acceleration", *XYZ)) is not None:
         out["specific_force"] = flu_from_frd(period_mean(filtered.t, filtered.stack(*XYZ), air.clock))
         used.append(filtered)
-        notes.append("the accelerometer is PX4's filtered vehicle_acceleration")
+        if "specific_force" not in log.chosen:
+            notes.append("the accelerometer is PX4's filtered vehicle_acceleration")
     else:
         notes.append(f"no accelerometer of {FAST:.0f} Hz or more in the log (sensor_combined)")
-    if (rates := fast("vehicle_angular_velocity", *XYZ)) is not None:
+    if (rates := fast("angular_velocity", "vehicle_angular_velocity", *XYZ)) is not None:
         out["angular_velocity"] = flu_from_frd(period_mean(rates.t, rates.stack(*XYZ), air.clock))
-    elif (gyro := fast("sensor_combined", *GYROSCOPE)) is not None:
+    elif (gyro := fast("angular_velocity", "sensor_combined", *GYROSCOPE)) is not None:
         out["angular_velocity"] = flu_from_frd(period_mean(gyro.t, gyro.stack(*GYROSCOPE), air.clock))
     return out, used, notes
 
@@ -165,7 +174,7 @@ def _commands(log: Log, air: Airborne, vehicle: Vehicle) -> tuple[dict[str, np.n
     clock, armed = air.clock, air.armed
     first, last = air.span
     count = motor_count(log)
-    thrust = commanded_thrust(log, first, last, count)
+    thrust = commanded_thrust(log.of("thrust_command"), first, last, count)
     if thrust is None:
         raise InputError(
             f"{log.origin}: no thrust command in the log (vehicle_thrust_setpoint, actuator_controls_0, "
@@ -184,13 +193,13 @@ def _commands(log: Log, air: Airborne, vehicle: Vehicle) -> tuple[dict[str, np.n
     if count != 4:
         notes.append(f"{count} motors: the collective is read, what single motors did is not")
     else:
-        if (motors := motor_commands(log, first, last, 4)) is not None:
+        if (motors := motor_commands(log.of("motor_command"), first, last, 4)) is not None:
             commands = np.stack([_interpolated(motors.t, c, clock) for c in motors.commands.T], -1)
             out["motor_command"] = np.where(armed[:, None], np.nan_to_num(commands), 0.0)
-        esc = rotor_speeds(log, first, last, 4)
+        esc = rotor_speeds(log.of("rotor_speed"), first, last, 4)
         if esc is not None and esc[2] >= 10.0:
             out["rotor_speed"] = np.stack([np.interp(clock, esc[0], c) for c in esc[1].T], -1)
-    rates = log.topic("vehicle_rates_setpoint", "roll", "pitch", "yaw")
+    rates = log.of("body_rate_command").topic("vehicle_rates_setpoint", "roll", "pitch", "yaw")
     if rates is not None and rates.rate_within(first, last) >= 0.2 * RATE:
         wanted = flu_from_frd(rates.stack("roll", "pitch", "yaw"))
         out["body_rate_command"] = np.nan_to_num(

@@ -10,12 +10,14 @@ import contextlib
 import io
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from trueflight.groundstation.reading.sources import FROM, Sources
+from trueflight.models.errors import InputError
 from trueflight.models.outside import unreadable
 
 TOPICS = (
@@ -52,6 +54,8 @@ SANE = {
     "actuator_motors": 2.0,
     "vehicle_angular_velocity": 200.0,
     "sensor_combined": 2000.0,
+    "sensor_accel": 2000.0,
+    "sensor_gyro": 200.0,
     "vehicle_acceleration": 2000.0,
 }
 """Magnitudes that no sample of a topic reaches (normalised, rad/s, m/s²): more is damage, not flight."""
@@ -96,7 +100,7 @@ class Topic:
 class Log:
     """A log: the instances of each topic by name, parameters at its start, their later changes (time in s, name,
     value), and what the file itself had to tell. `advice` says how to record what is missing, `faster` how to record
-    more of it."""
+    more of it. `chosen` are the topics that were asked for, by quantity."""
 
     origin: str
     topics: dict[str, tuple[Topic, ...]]
@@ -107,6 +111,15 @@ class Log:
     notes: tuple[str, ...] = ()
     advice: str = "log with PX4's default profile (SDLOG_PROFILE 1)"
     faster: str = "SDLOG_PROFILE 3 logs manoeuvres faster"
+    chosen: dict[str, Topic] = field(default_factory=dict)
+
+    def of(self, quantity: str) -> Log:
+        """The log as a quantity is to be read from it: where a topic was chosen for it, without those that compete."""
+        topic = self.chosen.get(quantity)
+        if topic is None:
+            return self
+        left = {name: topics for name, topics in self.topics.items() if name not in FROM[quantity]}
+        return replace(self, topics={**left, topic.name: (topic,)})
 
     def topic(self, name: str, *needed: str) -> Topic | None:
         """The first instance of a topic that has the needed fields."""
@@ -121,18 +134,23 @@ class Log:
         return self.parameters | {name: value for when, name, value in self.changes if when <= t}
 
 
-def load_ulog(path: Path) -> Log:
-    """Read a ULog, also one that is cut short or damaged. Raises `InputError` for a file that is no ULog."""
+def load_ulog(path: Path, sources: Sources | None = None) -> Log:
+    """Read a ULog, also one that is cut short or damaged, with the topics that `sources` choose. Raises `InputError`
+    for a file that is no ULog, or a topic that it has not."""
     with unreadable(path, "the log", "copy it from the vehicle's card again", "not a whole ULog"):
-        return _loaded(path)
+        return _loaded(path, sources or Sources())
 
 
-def _loaded(path: Path) -> Log:
+ON_DEMAND = ("sensor_accel", "sensor_gyro")
+"""Topics that are large, and are read only where they are chosen."""
+
+
+def _loaded(path: Path, sources: Sources) -> Log:
     from pyulog import ULog
 
     # pyulog prints what it meets in a damaged file; we tell it ourselves.
     with contextlib.redirect_stdout(io.StringIO()), io.FileIO(path) as file:
-        log = ULog(_Stream(file), message_name_filter_list=list(TOPICS))
+        log = ULog(_Stream(file), message_name_filter_list=[*TOPICS, *(ON_DEMAND if sources.topics else ())])
     notes = []
     if log.dropouts:
         lost = sum(d.duration for d in log.dropouts) / 1000
@@ -140,7 +158,10 @@ def _loaded(path: Path) -> Log:
     if log.file_corruption:
         notes.append("parts of the log are damaged and were skipped")
     release = log.get_version_info()
-    topics, said = _selected(collect((d.name, int(d.multi_id), dict(d.data)) for d in log.data_list))
+    every = collect((d.name, int(d.multi_id), dict(d.data)) for d in log.data_list)
+    chosen = {quantity: _asked_for(path, every, quantity, name) for quantity, name in sources.topics}
+    notes += [f"{quantity} is from {name}, as chosen" for quantity, name in sources.topics]
+    topics, said = _selected({name: every[name] for name in every if name not in ON_DEMAND})
     notes += said
     return Log(
         str(path),
@@ -152,7 +173,33 @@ def _loaded(path: Path) -> Log:
         _version(release),
         "".join(c for c in str(log.msg_info_dict.get("ver_hw", ""))[:40] if c.isprintable()),
         tuple(notes),
+        chosen=chosen,
     )
+
+
+def _asked_for(path: Path, topics: dict[str, tuple[Topic, ...]], quantity: str, asked: str) -> Topic:
+    """The topic that was chosen for a quantity, `NAME` or `NAME:INSTANCE`, under the name by which PX4's choice is
+    read. Raises `InputError` with the list for one that the log has not."""
+    offered = {f"{t.name}:{t.instance}": t for name in FROM[quantity] for t in topics.get(name, ())}
+    wanted = offered.get(asked if ":" in asked else f"{asked}:0")
+    if wanted is None:
+        has = ", ".join(name.removesuffix(":0") for name in offered) or "nothing that could be it"
+        raise InputError(f"{path}: no topic '{asked}' for {quantity} in the log; it has {has}")
+    return _renamed(wanted)
+
+
+def _renamed(topic: Topic) -> Topic:
+    """An estimator's or a sensor's topic as PX4's own choice among them would be named."""
+    estimated = {
+        "estimator_attitude": "vehicle_attitude",
+        "estimator_local_position": "vehicle_local_position",
+        "sensor_accel": "vehicle_acceleration",
+        "sensor_gyro": "vehicle_angular_velocity",
+    }
+    fields = dict(topic.fields)
+    if topic.name in ON_DEMAND:
+        fields |= {f"xyz[{i}]": topic.fields[axis] for i, axis in enumerate("xyz") if axis in topic.fields}
+    return Topic(estimated.get(topic.name, topic.name), topic.t, fields, topic.instance)
 
 
 class _Stream(io.BufferedReader):

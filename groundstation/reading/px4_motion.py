@@ -36,6 +36,7 @@ def motion_of(
     """Position, velocity and the position that was followed, ENU; heights above the ground at each takeoff. And where
     (N,) the estimate can be used."""
     clock = air.clock
+    references, log = _references(log.of("position_reference"), air), log.of("position")
     local = log.topic("vehicle_local_position", "x", "y", "z")
     usable = np.ones(len(clock), dtype=bool)
     notes: list[str] = []
@@ -58,7 +59,7 @@ def motion_of(
         for name, ned in (("position", position), ("velocity", velocity))
         if ned is not None
     }
-    at |= _references(log, air)
+    at |= references
     ground, said = ground_level(at["position"][:, 2], air)
     at["position"][:, 2] -= ground
     if "position_reference" in at:

@@ -19,6 +19,9 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Header, Message, Schema
 
 from trueflight.groundstation.reading.px4_log import TOPICS, Log, collect
+from trueflight.groundstation.reading.ros_choice import choose
+from trueflight.groundstation.reading.ros_vehicles import Fields, Source
+from trueflight.groundstation.reading.sources import Sources
 from trueflight.groundstation.reading.uniform import continuous_quaternion
 from trueflight.models.errors import InputError
 from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, rotate
@@ -61,40 +64,41 @@ def is_ros_bag(path: Path) -> bool:
     return False
 
 
-def load_ros_bag(path: Path) -> Log:
-    """Read a recording, also one that was cut off, into the topics of a PX4 log. Raises `InputError` for one that
-    holds none of them."""
+def load_ros_bag(path: Path, wanted: Sources | None = None) -> Log:
+    """Read a recording, also one that was cut off, into the topics of a PX4 log: those of one vehicle, as `wanted`.
+
+    Raises `InputError` for one that holds none of them, and where nothing tells which of several to take.
+    """
     recorded, seen, notes = _read(path)
-    vehicles: dict[str, int] = {}
-    for one in recorded:
-        if one.kind.startswith("px4_msgs/"):
-            space = one.topic.rpartition("/fmu/")[0]
-            vehicles[space] = vehicles.get(space, 0) + len(one.rows)
-    if len(vehicles) > 1:
-        chosen = max(vehicles, key=lambda space: vehicles[space])
-        notes.append(f"{len(vehicles)} vehicles in the recording; the one of {chosen or '/'}/fmu is read")
-        recorded = [
-            one
-            for one in recorded
-            if not one.kind.startswith("px4_msgs/") or one.topic.rpartition("/fmu/")[0] == chosen
-        ]
     notes += _one_clock(recorded)
-    parts = list(_px4_parts(recorded))
-    own = {name for name, _, _ in parts}
-    for source, made in _ros_parts(recorded):
-        new = [part for part in made if part[0] not in own]
-        if new:
-            parts += new
-            own |= {part[0] for part in new}
-            notes.append(f"{', '.join(sorted({part[0] for part in new}))} from {source}")
-    topics = collect(parts)
+    chosen = choose(str(path), [_source(one) for one in recorded], wanted or Sources())
+    notes += chosen.notes
+    topics = collect((name, 0, fields) for name, fields in chosen.parts)
     if not topics:
         has = "; ".join([seen or "no messages", *notes[:1]])
         raise InputError(
             f"{path}: none of the topics of a PX4 flight is in the recording (it has {has}); {ADVICE}"
         )
+    asked = {
+        quantity: topic
+        for quantity, (name, fields) in chosen.asked.items()
+        for topic in collect([(name, 0, fields)]).get(name, ())
+    }
+    advice = ADVICE
+    if len(chosen.vehicles) > 1:
+        listed = ", ".join(vehicle or "/" for vehicle in chosen.vehicles)
+        advice = (
+            f"of {len(chosen.vehicles)} vehicles ({listed}) the first is read: choose another with "
+            f"--vehicle-namespace, or {ADVICE}"
+        )
     return Log(
-        str(path), topics, hardware="", notes=tuple(notes), faster="record the topic faster", advice=ADVICE
+        str(path),
+        topics,
+        hardware="",
+        notes=tuple(notes),
+        faster="record the topic faster",
+        advice=advice,
+        chosen=asked,
     )
 
 
@@ -219,43 +223,16 @@ def _stamp(one: _Recorded) -> np.ndarray:
     return np.asarray(stamp if np.all(stamp > 0) else np.array(one.received, dtype=float))
 
 
-def _px4_parts(recorded: list[_Recorded]) -> Iterator[tuple[str, int, dict[str, np.ndarray]]]:
-    by_name: dict[str, list[_Recorded]] = {}
-    for one in recorded:
-        if one.kind.startswith("px4_msgs/"):
-            by_name.setdefault(_px4_name(one.topic), []).append(one)
-    for name, several in by_name.items():
-        # What PX4 sends tells what it did; what it was sent only stands in.
-        several.sort(key=lambda one: ("/out/" not in one.topic, -len(one.rows)))
-        fields = several[0].columns()
-        for stamp in ("timestamp", "timestamp_sample"):
-            if stamp in fields:
-                fields[stamp] = np.where(fields[stamp] > 0, fields[stamp] + several[0].shift, 0)
-        fields["timestamp"] = _stamp(several[0]) + several[0].shift
-        yield name, 0, fields
-
-
-Part = tuple[str, int, dict[str, np.ndarray]]
-
-
-def _ros_parts(recorded: list[_Recorded]) -> Iterator[tuple[str, list[Part]]]:
-    """Parts made of ROS' own messages, best source first."""
-    order = list(_TRANSLATED)
-    mine = [one for one in recorded if one.kind in _TRANSLATED]
-    # Of two topics of a type that with the more messages; of MAVROS' targets what PX4 reports back.
-    for one in sorted(
-        mine, key=lambda one: (order.index(one.kind), "target" not in one.topic, -len(one.rows))
-    ):
-        columns = one.columns()
-        made = _TRANSLATED[one.kind](one, columns)
-        stamp = _stamp(one) + one.shift
-        yield (
-            f"{one.topic} ({one.kind})",
-            [(name, 0, {"timestamp": stamp, **fields}) for name, fields in made],
-        )
-
-
-Fields = dict[str, np.ndarray]
+def _source(one: _Recorded) -> Source:
+    """A topic as PX4's own would be: times of one clock, NED and FRD."""
+    fields, stamp = one.columns(), _stamp(one) + one.shift
+    if not one.kind.startswith("px4_msgs/"):
+        made = _TRANSLATED[one.kind](one, fields)
+        return Source(one.topic, one.kind, 1e-6 * stamp, {n: {"timestamp": stamp, **f} for n, f in made})
+    if "timestamp_sample" in fields:
+        sample = fields["timestamp_sample"]
+        fields["timestamp_sample"] = np.where(sample > 0, sample + one.shift, 0)
+    return Source(one.topic, one.kind, 1e-6 * stamp, {_px4_name(one.topic): {**fields, "timestamp": stamp}})
 
 
 def _odometry(one: _Recorded, columns: Fields) -> list[tuple[str, Fields]]:
@@ -315,7 +292,10 @@ def _imu(one: _Recorded, columns: Fields) -> list[tuple[str, Fields]]:
 
 
 def _battery(one: _Recorded, columns: Fields) -> list[tuple[str, Fields]]:
-    return [("battery_status", {"voltage_v": columns["voltage"]})]
+    made = {"voltage_v": columns["voltage"]}
+    if "current" in columns:  # negative while it gives, by the message's definition
+        made["current_a"] = np.abs(columns["current"])
+    return [("battery_status", made)]
 
 
 def _target(one: _Recorded, columns: Fields) -> list[tuple[str, Fields]]:

@@ -230,7 +230,7 @@ def _thrust(log: Log, air: Airborne | None) -> tuple[Line, ...]:
            'to "quadratic": the effect thrust_curve tells'),
     )  # fmt: skip
     voltage = None
-    if air is not None and (battery := battery_in_use(log, air)) is not None:
+    if air is not None and (battery := battery_in_use(log, air)[0]) is not None:
         flown = (battery.t >= air.span[0]) & (battery.t <= air.span[1])
         voltage = float(np.median(np.asarray(battery.fields["voltage_v"])[flown]))
     capacity = next((c for p in ("BAT1_CAPACITY", "BAT_CAPACITY") if (c := log.parameter(p) or 0) > 0), 0)

@@ -44,9 +44,9 @@ class Flown:
 
 
 @cache
-def flown(seed: int = 3) -> Flown:
-    """A circle with rotor drag, between a takeoff and a landing."""
-    flight = simulated(seed, "rotor_drag:0.4", kind="circle")
+def flown(seed: int = 3, kind: str = "circle") -> Flown:
+    """A circle (or another trajectory) with rotor drag, between a takeoff and a landing."""
+    flight = simulated(seed, "rotor_drag:0.4", kind=kind)
     ground, climb = round(100 * GROUND), round(100 * CLIMB)
     s = np.linspace(0.0, 1.0, climb, endpoint=False)
     rise, speed = 10 * s**3 - 15 * s**4 + 6 * s**5, (30 * s**2 - 60 * s**3 + 30 * s**4) / CLIMB
