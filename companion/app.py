@@ -11,6 +11,7 @@ from typing import Any
 
 import zenoh
 
+from trueflight.companion.batteries import Batteries
 from trueflight.companion.deployment import Deployment
 from trueflight.companion.director import Director
 from trueflight.companion.flight import FlightStateMachine
@@ -81,7 +82,8 @@ class Companion:
         signatures.sweep()
         session = open_planned(plan)
         try:
-            self.link = VehicleLink(settings.connect, settings.timeout, settings.system)
+            batteries = Batteries(settings.battery, vehicle.nominal_voltage)
+            self.link = VehicleLink(settings.connect, settings.timeout, settings.system, batteries)
         except InputError:
             session.close()
             raise
@@ -137,11 +139,16 @@ class Companion:
         self.link.on_error = self._wire_error
         self.link.on_blind = self.watchdog.tick  # nothing to control by, but the control thread is well
         self.link.messages.on_notice = self._autopilot_tells
+        self.link.others.tell(lambda text: self.emit("info", "others", text))
         try:
             self._settle_rates(rate)
         except InputError:
             self.close()
             raise
+        self.link.read_capacities()
+        batteries = self.link.latest.batteries
+        if len(batteries.connected) > 1 or batteries.why_not:
+            self.emit("warning", "batteries", batteries.why_not or f"several batteries: {batteries.words}")
 
     def run(self) -> None:
         """Fly missions until `stop`; the calling thread must be the one that may block."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trueflight.companion import onboard_commands
-from trueflight.models.errors import run_command_line
+from trueflight.models.errors import InputError, run_command_line
 from trueflight.models.printed import print_json_line
 
 if TYPE_CHECKING:
@@ -40,6 +40,10 @@ Rate = Annotated[float | None, typer.Option(help="Control rate, Hz: the odometry
 System = Annotated[
     int | None, typer.Option(help="MAVLink system id of the autopilot (MAV_SYS_ID), where several are heard.")
 ]
+Battery = Annotated[
+    int | None,
+    typer.Option(help="PX4's number of the flight's battery (BAT1_*: 1), where there are several."),
+]
 Timeout = Annotated[float | None, typer.Option(help="Seconds to wait for an autopilot.")]
 
 
@@ -54,6 +58,7 @@ def run(
     ] = None,
     connect: Connect = None,
     system: System = None,
+    battery: Battery = None,
     rate: Rate = None,
     timeout: Timeout = None,
     records: Annotated[Path | None, typer.Option(help="Folder of the flight records.")] = None,
@@ -95,6 +100,7 @@ def run(
         "design": design,
         "connect": connect,
         "system": system,
+        "battery": battery,
         "rate": rate,
         "timeout": timeout,
         "records": records,
@@ -158,6 +164,7 @@ def _serve(companion: Companion, address: str) -> None:
 def check(
     connect: Connect = None,
     system: System = None,
+    battery: Battery = None,
     rate: Rate = None,
     timeout: Timeout = None,
     as_json: Json = False,
@@ -167,18 +174,21 @@ def check(
     from rich.markup import escape
     from rich.table import Table
 
+    from trueflight.companion.batteries import Batteries
     from trueflight.companion.settings import Settings
     from trueflight.companion.vehicle_link import VehicleLink
 
     defaults = Settings()
-    link = VehicleLink(
-        connect or defaults.connect, timeout if timeout is not None else defaults.timeout, system or 0
-    )
+    wait = timeout if timeout is not None else defaults.timeout
+    link = VehicleLink(connect or defaults.connect, wait, system or 0, Batteries(battery or 0))
     try:
         wanted = rate if rate is not None else defaults.rate
         link.commands.request_rates(wanted)
         link.measure(0.5)  # the new rates take a moment
         rates = link.measure(2.0)
+        if link.ambiguous:
+            raise InputError(link.ambiguous)
+        link.read_capacities()
         names = ("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_RC_IN_MODE", "EKF2_PREDICT_US")
         report: dict[str, Any] = {
             "address": link.address,
@@ -188,10 +198,12 @@ def check(
             "armed": link.latest.armed,
             "landed": link.latest.landed,
             "battery_voltage": link.latest.battery_voltage,
+            "batteries": link.latest.batteries.describe(),
             "rotor_speeds": len(link.latest.rotor_speed),
             "accelerometer": link.latest.specific_force is not None,
             "parameters": {name: link.parameters.read(name) for name in names},
             "malformed_messages": link.malformed,
+            "others": link.others.describe(),
         }
     finally:
         link.close()

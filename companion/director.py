@@ -83,6 +83,7 @@ class Director:
             "armed": latest.armed,
             "landed": latest.landed,
             "battery_voltage": round(latest.battery_voltage, 3),
+            "batteries": latest.batteries.describe(),
             "position": {} if latest.estimator is None else latest.estimator.describe(),
             "ready": not not_ready,
             "not_ready": not_ready,
@@ -95,6 +96,7 @@ class Director:
             "pose": {} if pose is None else pose.status(),
             "recording": self._records.path,
             "malformed_messages": self._link.malformed,
+            "others": self._link.others.describe(),
             **self._deployment.store.describe(),
         }
 
@@ -144,6 +146,7 @@ class Director:
         """Fly what is asked until `stopping` is set; then land what is in the air and return."""
         while not self.stopping.wait(0.02):
             self._deployment.settle()
+            self._link.notice_systems()
             with self._lock:
                 progress = self._queue.popleft() if self._queue else None
             if progress is not None:

@@ -22,12 +22,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from trueflight.companion.access import access_findings
+from trueflight.companion.address import serial_ports
 from trueflight.companion.findings import FAIL, NOTE, OK, WARN, Finding
 from trueflight.companion.inspection import inspect
 from trueflight.companion.message_rates import link_too_slow, odometry_too_low
 from trueflight.companion.settings import Settings
 from trueflight.companion.store import live_file
-from trueflight.companion.vehicle_link import VehicleLink
+from trueflight.companion.vehicle_link import NoAutopilot, VehicleLink
 from trueflight.companion.zenoh_session import plan_session
 from trueflight.models.design import load_design
 from trueflight.models.errors import InputError
@@ -90,12 +91,10 @@ def _serial(settings: Settings, root: Path) -> Iterator[Finding]:
     if not scheme.startswith("serial"):
         yield Finding("link", settings.connect, "", "", OK)
         return
-    name, _, speed = rest.partition(":")
+    name, _, speed = rest.rpartition(":") if rest.rpartition(":")[2].isdigit() else (rest, "", "")
     path = root / name.lstrip("/")
     if not path.exists():
-        known = sorted({*root.glob("dev/ttyAMA*"), *root.glob("dev/ttyTHS*"), *root.glob("dev/ttyACM*")})
-        known += sorted(root.glob("dev/ttyUSB*"))
-        there = ", ".join("/" + str(port.relative_to(root)) for port in known) or "none"
+        there = ", ".join(serial_ports(root)) or "none"
         advice = f"serial ports here: {there}; on a Raspberry Pi enable_uart=1 in config.txt, then restart"
         yield Finding("serial port", f"{name} is not there", "", advice, FAIL)
         return
@@ -129,14 +128,19 @@ def _rates(settings: Settings, root: Path) -> Iterator[Finding]:
     try:
         link = VehicleLink(settings.connect, settings.timeout, settings.system)
     except InputError as error:
-        advice = "power it; cable: TX to RX; PX4: MAV_1_CONFIG 102 (TELEM2), MAV_1_MODE 2 (Onboard)"
-        yield Finding("autopilot", "none", "", f"{error}; {advice}", FAIL)
+        silent = isinstance(error, NoAutopilot)
+        cable = "; power it; cable: TX to RX; PX4: MAV_1_CONFIG 102 (TELEM2), MAV_1_MODE 2 (Onboard)"
+        yield Finding("autopilot", "none", "", f"{error}{cable if silent else ''}", FAIL)
         return
     try:
         link.commands.request_rates(settings.rate)
         time.sleep(0.5)
         rates = link.measure(2.0)
         reason = odometry_too_low(rates, settings.rate)
+        if link.ambiguous:
+            yield Finding("autopilot", "several", "", link.ambiguous, FAIL)
+        for sender in link.others.describe():
+            yield Finding("heard as well", sender, "", "nothing of it is used", NOTE)
         yield Finding(
             "autopilot", f"{link.commands.autopilot_version()}, {link.latest.flight_mode}", "", "", OK
         )

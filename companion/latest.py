@@ -7,6 +7,7 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 
+from trueflight.companion.batteries import Batteries
 from trueflight.companion.estimator import EstimatorStatus
 from trueflight.companion.odometry import ImuSample, Vector, imu_from_wire
 
@@ -34,7 +35,7 @@ _MODES = {
 class Latest:
     """The last of everything that arrives beside the odometry; written by MAVSDK's thread, read by any.
 
-    `battery_voltage` V (0 unknown) is that of the battery with the lowest number, `batteries` has all of them.
+    `battery_voltage` V (0 unknown) is that of the flight's battery, `batteries` has all of them.
     `rotor_speed` rad/s (empty unknown). `imu` is HIGHRES_IMU as it came, not yet read: it arrives just before the
     odometry, and what it takes to read it would delay the setpoint. `mode_time_us` is when mode and arming were told
     last, by the vehicle's clock: the stamp of the odometry that came before it, however late either was read.
@@ -45,7 +46,7 @@ class Latest:
     """
 
     battery_voltage: float = 0.0
-    batteries: dict[int, float] = field(default_factory=dict)
+    batteries: Batteries = field(default_factory=Batteries)
     rotor_speed: tuple[float, ...] = ()
     flight_mode: str = "UNKNOWN"
     mode_time_us: int | None = None

@@ -27,14 +27,15 @@ class Messages:
 
     `handlers` maps names of messages to what takes their fields; one raises `KeyError`, `TypeError`, `ValueError` or
     `IndexError` for fields that are none of that message. `arming` collects the arming checks, `version` is that of
-    the autopilot, '' before it was told. `on_notice` gets what the autopilot tells of failsafes, switches and failed
-    checks, in plain words.
+    the autopilot, '' before it was told, `kind` its MAV_AUTOPILOT and its vehicle's MAV_TYPE. `on_notice` gets what the
+    autopilot tells of failsafes, switches and failed checks, in plain words.
     """
 
     def __init__(self, arrivals: Arrivals, counter: MessageCounter) -> None:
         self.latest = Latest()
         self.arming = ArmingChecks()
         self.version = ""
+        self.kind: tuple[int, int] | None = None
         self.on_notice: Callable[[str], None] = lambda text: None
         self.handlers: dict[str, Callable[[Fields], None]] = {
             "BATTERY_STATUS": self._battery,
@@ -60,10 +61,8 @@ class Messages:
 
     def _battery(self, fields: Fields) -> None:
         self._counter.count("BATTERY_STATUS")
-        cells = [mv for mv in fields["voltages"] + fields.get("voltages_ext", []) if mv not in (0, 0xFFFF)]
-        batteries = self.latest.batteries
-        batteries[int(fields["id"])] = 1e-3 * sum(cells)
-        self.latest.battery_voltage = batteries[min(batteries)]
+        self.latest.batteries.take(fields)
+        self.latest.battery_voltage = self.latest.batteries.voltage
 
     def _esc(self, fields: Fields) -> None:
         self._counter.count("ESC_STATUS")
@@ -78,6 +77,7 @@ class Messages:
 
     def _heartbeat(self, fields: Fields) -> None:
         self._mode_told()
+        self.kind = int(fields["autopilot"]), int(fields["type"])
         self.latest.heartbeat = 1e-9 * fields["arrived"]
         self.latest.armed = bool(int(fields["base_mode"]) & _ARMED)
         self.latest.killed = int(fields["system_status"]) == _TERMINATED

@@ -33,6 +33,13 @@ ConnectOption = Annotated[
     typer.Option(help="MAVSDK address of the autopilot, such as udpin://127.0.0.1:14540 or serial://..."),
 ]
 RateOption = Annotated[float | None, typer.Option(help="Control rate, Hz: the odometry's.")]
+SystemOption = Annotated[
+    int | None, typer.Option(help="MAVLink system id of the autopilot (MAV_SYS_ID), where several are heard.")
+]
+BatteryOption = Annotated[
+    int | None,
+    typer.Option(help="PX4's number of the flight's battery (BAT1_*: 1), where there are several."),
+]
 TimeoutOption = Annotated[float | None, typer.Option(help="Seconds to wait for an autopilot.")]
 
 
@@ -56,6 +63,8 @@ def preflight_command(
     config: ConfigOption = None,
     vehicle: VehicleOption = None,
     connect: ConnectOption = None,
+    system: SystemOption = None,
+    battery: BatteryOption = None,
     rate: RateOption = None,
     timeout: TimeoutOption = None,
     records: Annotated[
@@ -72,14 +81,17 @@ def preflight_command(
     PX4 tells its reasons; run it on the ground, disarmed. Exit code 2 where a flight would be refused or end badly.
     """
     from trueflight.companion import preflight
+    from trueflight.companion.batteries import Batteries
     from trueflight.companion.findings import table_of
     from trueflight.companion.vehicle_link import VehicleLink
     from trueflight.models.vehicle import load_vehicle
 
-    settings = _settings(config, vehicle, connect, rate, timeout, records)
+    settings = _settings(
+        config, vehicle, connect, records, system=system, battery=battery, rate=rate, timeout=timeout
+    )
     settings.check_address()
     believed = load_vehicle(settings.vehicle) if settings.vehicle else None
-    link = VehicleLink(settings.connect, settings.timeout, settings.system)
+    link = VehicleLink(settings.connect, settings.timeout, settings.system, Batteries(settings.battery))
     changed: list[str] = []
     try:
         with _progress(as_json) as tell, _poses(settings, believed, link) as pose:
@@ -115,6 +127,7 @@ def doctor_command(
     config: ConfigOption = None,
     vehicle: VehicleOption = None,
     connect: ConnectOption = None,
+    system: SystemOption = None,
     rate: RateOption = None,
     timeout: TimeoutOption = None,
     root: Annotated[Path, typer.Option(help="Where the system's files are.", hidden=True)] = Path("/"),
@@ -128,7 +141,7 @@ def doctor_command(
     from trueflight.companion import doctor
     from trueflight.companion.findings import FAIL, rows_of, table_of
 
-    settings = _settings(config, vehicle, connect, rate, timeout, None)
+    settings = _settings(config, vehicle, connect, None, system=system, rate=rate, timeout=timeout)
     with _progress(as_json) as tell:
         findings = doctor.examine(settings, root, tell)
     failed = [finding for finding in findings if finding.state == FAIL]
@@ -200,19 +213,17 @@ def _settings(
     config: Path | None,
     vehicle: Path | None,
     connect: str | None,
-    rate: float | None,
-    timeout: float | None,
     records: Path | None,
+    **numbers: float | None,
 ) -> Settings:
     from trueflight.companion.settings import load_settings
 
     settings = load_settings(config)
     given: dict[str, Any] = {"vehicle": vehicle, "connect": connect, "records": records}
     flags: dict[str, Any] = {name: str(value) for name, value in given.items() if value is not None}
-    flags |= {name: value for name, value in (("rate", rate), ("timeout", timeout)) if value is not None}
+    flags |= {name: value for name, value in numbers.items() if value is not None}
     settings = replace(settings, **flags)
-    if not 10.0 <= settings.rate <= 1000.0:
-        raise InputError(f"rate = {settings.rate:g} is outside 10 to 1000 Hz")
+    settings.check_numbers()
     settings.pose.checked()
     settings.check_signing()
     return settings

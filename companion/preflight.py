@@ -92,9 +92,13 @@ def look(
     if link.latest.armed:
         raise InputError("the vehicle is armed; disarm it, then look again")
     progress("message rates")
+    link.latest.batteries.nominal = None if vehicle is None else vehicle.nominal_voltage
     link.commands.request_rates(settings.rate)
     time.sleep(0.5)
     rates = link.measure(2.0)
+    if link.ambiguous:
+        raise InputError(link.ambiguous)
+    link.read_capacities()
     if pose is not None:
         progress("mocap poses")
         end = time.monotonic() + _FUSED_WITHIN
@@ -167,6 +171,19 @@ def _arming(link: VehicleLink, settings: Settings, vehicle: Vehicle | None) -> I
         state = NOTE if voltage == 0.0 else OK if voltage >= low else FAIL
         told = f"{voltage:.1f} V" if voltage else "not told"
         yield Finding("battery", told, "", f"a flight needs {low:.1f} V ([safety] takeoff_voltage)", state)
+    yield from _several(link)
+
+
+def _several(link: VehicleLink) -> Iterator[Finding]:
+    """Batteries beside the one that decides, and who else speaks on the link."""
+    batteries = link.latest.batteries
+    if batteries.why_not:
+        yield Finding("battery", "not there", "", batteries.why_not, FAIL)
+    elif len(batteries.connected) > 1:
+        advice = "the lowest that is not left out decides; choose one with --battery"
+        yield Finding("batteries", batteries.words, "", advice, NOTE)
+    for sender, count in link.others.describe().items():
+        yield Finding("heard as well", f"{sender}: {count} messages", "", "nothing of them is used", NOTE)
 
 
 def _without_position(link: VehicleLink, settings: Settings) -> str:

@@ -50,9 +50,12 @@ class Readiness:
             return "the vehicle is armed by somebody else"
         low = self._safety.takeoff_voltage * self._vehicle.nominal_voltage
         if 0.0 < latest.battery_voltage < low:
-            return f"the battery has {latest.battery_voltage:.1f} V, a flight needs {low:.1f} V"
+            told = latest.batteries
+            which = f" ({told.words}; choose one with --battery)" if len(told.connected) > 1 else ""
+            return f"the battery has {latest.battery_voltage:.1f} V, a flight needs {low:.1f} V{which}"
         return (
-            self._records.why_not()
+            latest.batteries.why_not
+            or self._records.why_not()
             or self.blind
             or self._flight.agrees.standing
             or self._link.ambiguous

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import difflib
-import re
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from trueflight.companion.address import checked_address
 from trueflight.companion.agreement import AgreementLimits
 from trueflight.companion.law.control import Limits
 from trueflight.companion.law.controllers import TrimLimits
@@ -29,7 +29,8 @@ class Settings:
     """Everything `companion run` needs; the sections are the settings of the parts.
 
     `design` empty means `design.json` beside the vehicle file. `rate` in Hz, `timeout` in s to wait for an
-    autopilot, `system` its MAVLink system id, 0 for the first that is heard. `realtime` is the priority (SCHED_FIFO)
+    autopilot, `system` its MAVLink system id, 0 for the first that is heard, `battery` PX4's number of the flight's
+    battery, 0 for the lowest of those that fit. `realtime` is the priority (SCHED_FIFO)
     that the control thread asks for, 0 for none. `keys` is the vehicle's folder of `groundstation keys`;
     `unsigned_models` one of `companion.signature.UNSIGNED`. `require_record`: no flight begins whose record cannot be
     written.
@@ -39,6 +40,7 @@ class Settings:
     design: str = ""
     connect: str = "udpin://127.0.0.1:14540"
     system: int = field(default=0, metadata={"zero": True})
+    battery: int = field(default=0, metadata={"zero": True})
     timeout: float = 10.0
     rate: float = 100.0
     records: str = "records"
@@ -58,16 +60,7 @@ class Settings:
 
     def checked(self) -> Settings:
         """The same, or `InputError` for a value without sense."""
-        if not 10.0 <= self.rate <= 1000.0:
-            raise InputError(f"rate = {self.rate:g} is outside 10 to 1000 Hz")
-        if not 0 <= self.system <= 255:
-            raise InputError(
-                f"system = {self.system} is outside 1 to 255 (0: the first autopilot that is heard)"
-            )
-        if not 0.1 <= self.timeout <= 600.0:
-            raise InputError(f"timeout = {self.timeout:g} is outside 0.1 to 600 s")
-        if not 0 <= self.realtime <= 80:
-            raise InputError(f"realtime = {self.realtime} is outside 0 (off) to 80")
+        self.check_numbers()
         self.check_address()
         self.pose.checked()
         self.check_signing()
@@ -75,14 +68,24 @@ class Settings:
             raise InputError("no vehicle file; pass --vehicle FILE or set 'vehicle' in the configuration")
         return self
 
-    def check_address(self) -> None:
-        """Raise `InputError` for a serial address without its baud rate: the one taken then is too slow to fly with."""
-        if self.connect.startswith("serial") and not re.fullmatch(
-            r"serial\w*://[^:]+:[0-9]{4,8}", self.connect
-        ):
+    def check_numbers(self) -> None:
+        """Raise `InputError` for a number without sense."""
+        if not 10.0 <= self.rate <= 1000.0:
+            raise InputError(f"rate = {self.rate:g} is outside 10 to 1000 Hz")
+        if not 0 <= self.system <= 255:
             raise InputError(
-                f"{self.connect}: no baud rate in it; write serial:///dev/ttyAMA0:921600 (device, colon, baud rate)"
+                f"system = {self.system} is outside 1 to 255 (0: the first autopilot that is heard)"
             )
+        if not 0 <= self.battery <= 16:
+            raise InputError(f"battery = {self.battery} is outside 1 to 16 (0: the lowest of those that fit)")
+        if not 0.1 <= self.timeout <= 600.0:
+            raise InputError(f"timeout = {self.timeout:g} is outside 0.1 to 600 s")
+        if not 0 <= self.realtime <= 80:
+            raise InputError(f"realtime = {self.realtime} is outside 0 (off) to 80")
+
+    def check_address(self) -> None:
+        """Raise `InputError` for an address that is none."""
+        checked_address(self.connect)
 
     def check_signing(self) -> None:
         """Raise `InputError` for an `unsigned_models` without sense."""

@@ -30,7 +30,9 @@ from mavsdk.plugins.mocap.mocap import (
 )
 from mavsdk.system import System
 
+from trueflight.companion.address import checked_address, for_mavsdk, users_of, why_not_open
 from trueflight.companion.arrival import Arrivals
+from trueflight.companion.batteries import Batteries
 from trueflight.companion.commands import AUTOPILOT, Commands, Parameters
 from trueflight.companion.message_rates import MessageCounter, Rates
 from trueflight.companion.messages import Fields, Messages
@@ -42,10 +44,22 @@ from trueflight.companion.odometry import (
     vision_estimate,
     without_covariance,
 )
+from trueflight.companion.others import Others
 from trueflight.models.errors import InputError
 from trueflight.models.pose import Pose
 
 _TIMESYNC_RATE = 50.0  # Hz; PX4 wants 500 answers
+
+
+_PX4, _ARDUPILOT = 12, 3  # MAV_AUTOPILOT
+_NO_MULTIROTORS = {1: "a fixed-wing", 10: "a rover", 11: "a boat", 12: "a submarine"}  # MAV_TYPE
+_NO_MULTIROTORS |= dict.fromkeys(range(19, 26), "a VTOL")
+_MOST_SYSTEMS = 16  # that are counted; somebody may make up 255
+_HEARTBEATS = 2.5  # s; PX4 sends one a second
+
+
+class NoAutopilot(InputError):
+    """Nobody answers, or not the one that was asked for."""
 
 
 class VehicleLink:
@@ -54,12 +68,17 @@ class VehicleLink:
     Raises `InputError` where the address cannot be used or nobody answers within `timeout` s. `on_odometry`
     is called with each odometry message on the control thread, but for those that are repeated, or overtaken by newer
     ones; what it raises ends up in `on_error` and sends nothing; `on_blind` takes its place for a message without an
-    estimate. `system` is the MAVLink system that is flown, 0 the first autopilot that is heard. What else it tells is
-    in `messages`, the last of it in `latest`; what it is asked goes through `commands` and `parameters`.
+    estimate. `system` is the MAVLink system that is flown, 0 the first autopilot that is heard; `batteries` judges
+    which of its batteries counts. What else it tells is in `messages`, the last of it in `latest`; what it is asked
+    goes through `commands` and `parameters`. Who else speaks on the link is counted in `others`.
     """
 
     def __init__(
-        self, address: str = "udpin://127.0.0.1:14540", timeout: float = 10.0, system: int = 0
+        self,
+        address: str = "udpin://127.0.0.1:14540",
+        timeout: float = 10.0,
+        system: int = 0,
+        batteries: Batteries | None = None,
     ) -> None:
         self.address = address
         self.on_odometry: Callable[[Odometry], None] = lambda odometry: None
@@ -70,15 +89,19 @@ class VehicleLink:
         self.counter = MessageCounter()
         self.messages = Messages(self.arrivals, self.counter)
         self.latest = self.messages.latest
+        self.latest.batteries = batteries or Batteries()
+        self.others = Others()
         self._overtaken = 0
         self._shares_clock = False
         self._closing = False
+        checked_address(address)
         self._mavsdk = self._opened()
         autopilot = self._autopilot(timeout, system)
         self._system = autopilot.get_system_id()
         self._chosen = bool(system)
+        self._systems: dict[int, MavlinkDirect] = {}
         self._mocap = Mocap(autopilot)
-        self._direct = MavlinkDirect(autopilot)
+        self._direct = self._systems[self._system] = MavlinkDirect(autopilot)
         self.commands = Commands(self._direct, self._system, self.messages)
         self.parameters = Parameters(autopilot)
         handlers = {
@@ -90,11 +113,13 @@ class VehicleLink:
         for name, handler in handlers.items():
             self._direct.subscribe_message(name, self._safe(handler))
         self._direct.subscribe_message("HIGHRES_IMU", self._imu)
+        self._check_kind(min(timeout, _HEARTBEATS))
 
     def close(self) -> None:
         """Disconnect."""
         self._closing = True
-        self._direct.destroy()
+        for direct in self._systems.values():
+            direct.destroy()
         self._mavsdk.destroy()
 
     def _opened(self) -> Mavsdk:
@@ -102,14 +127,9 @@ class VehicleLink:
         mavsdk.log_subscribe(lambda level, text, file, line: True)
         # A ground station's heartbeat would turn STATUSTEXT on, but PX4 then counts us as its data link.
         wire = Mavsdk(Configuration.create_with_component_type(mavsdk.ComponentType.COMPANION_COMPUTER))
-        result = wire.add_any_connection(self.address)
-        if result != mavsdk.ConnectionResult.SUCCESS:
+        if wire.add_any_connection(for_mavsdk(self.address)) != mavsdk.ConnectionResult.SUCCESS:
             wire.destroy()
-            reason = result.name.lower().replace("_", " ")
-            raise InputError(
-                f"cannot open {self.address} ({reason}): is another program using the port, or the address "
-                "misspelt?"
-            )
+            raise InputError(f"cannot open {self.address}: {why_not_open(self.address)}")
         return wire
 
     def _autopilot(self, timeout: float, number: int) -> System:
@@ -125,11 +145,46 @@ class VehicleLink:
             self._mavsdk.destroy()
             which = f"no autopilot with system id {number}" if number else "no autopilot"
             others = f"; heard there: {', '.join(map(str, heard_ids))}" if heard_ids else ""
-            raise InputError(
+            user = users_of(self.address) if self.address.startswith("serial") else ""
+            user = f"; {user}" if user else ""
+            raise NoAutopilot(
                 f"{which} answering on {self.address} within {timeout:g} s{others}; start it, or pass its address "
-                f"with --connect{' and its MAV_SYS_ID with --system' if number else ''}"
+                f"with --connect{' and its MAV_SYS_ID with --system' if number else ''}{user}"
             )
         return found
+
+    def _check_kind(self, patience: float) -> None:
+        """Raise `InputError` where what answers is no PX4 or no multirotor; silence is found later."""
+        end = time.monotonic() + patience
+        while self.messages.kind is None and time.monotonic() < end:
+            time.sleep(0.02)
+        autopilot, vehicle = self.messages.kind or (_PX4, 0)
+        if autopilot == _PX4 and vehicle not in _NO_MULTIROTORS:
+            return
+        self.close()
+        who = (
+            f"PX4 of {_NO_MULTIROTORS[vehicle]} (MAV_TYPE {vehicle})"
+            if autopilot == _PX4
+            else "ArduPilot"
+            if autopilot == _ARDUPILOT
+            else f"an autopilot of another kind (MAV_AUTOPILOT {autopilot})"
+        )
+        raise InputError(
+            f"{who} answers on {self.address} as system {self._system}, but only multirotors with PX4 (1.14 or newer) "
+            "can be flown; pass another address with --connect, or another system with --system"
+        )
+
+    def read_capacities(self) -> None:
+        """Ask for the batteries' capacities where several are connected; a second for each that PX4 does not know."""
+        batteries = self.latest.batteries
+        several = batteries.connected
+        if len(several) < 2 or batteries.chosen:
+            return
+        for one in several:
+            capacity = self.parameters.read(f"BAT{one.number}_CAPACITY")
+            if capacity is not None and capacity > 0.0:
+                batteries.capacities[one.number] = float(capacity)
+        self.latest.battery_voltage = batteries.voltage
 
     @property
     def ambiguous(self) -> str:
@@ -147,7 +202,29 @@ class VehicleLink:
 
     def measure(self, duration: float = 1.0) -> Rates:
         """Count what arrives for `duration` s."""
-        return self.counter.measure(duration)
+        self.notice_systems()
+        rates = self.counter.measure(duration)
+        self.notice_systems()
+        return rates
+
+    def notice_systems(self) -> None:
+        """Count other systems' heartbeats too, which MAVSDK keeps apart from ours; cheap where no system is new.
+
+        One thread at a time.
+        """
+        if self._mavsdk.system_count() <= len(self._systems) or len(self._systems) > _MOST_SYSTEMS:
+            return
+        for one in self._mavsdk.get_systems():
+            number = one.get_system_id()
+            if number in self._systems:
+                continue
+            for component in one.component_ids():
+                self.others.count(number, component)
+            self._systems[number] = MavlinkDirect(one)
+            self._systems[number].subscribe_message("HEARTBEAT", self._count_other)
+
+    def _count_other(self, message: MavlinkMessage, _: Any) -> None:
+        self.others.count(message.system_id, message.component_id)
 
     # What goes out
 
@@ -216,6 +293,7 @@ class VehicleLink:
         def callback(message: MavlinkMessage, _: Any) -> None:
             arrived = time.monotonic_ns()
             if not self._is_autopilot(message):
+                self.others.count(message.system_id, message.component_id)
                 return
             try:
                 fields = json.loads(without_covariance(message.fields_json))
@@ -270,3 +348,5 @@ class VehicleLink:
     def _imu(self, message: MavlinkMessage, _: Any) -> None:
         if self._is_autopilot(message):
             self.messages.imu(message.fields_json)
+        else:
+            self.others.count(message.system_id, message.component_id)

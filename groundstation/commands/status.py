@@ -115,7 +115,7 @@ def _print_status(status: dict[str, Any], records: int) -> None:
             f"{status['phase']}, {status['flight_mode'] or 'no mode'}, "
             f"{'armed' if status['armed'] else 'disarmed'}",
         ),
-        ("battery", f"{status['battery_voltage']:.2f} V"),
+        ("battery", f"{status['battery_voltage']:.2f} V{escape(_several(status.get('batteries') or []))}"),
         ("position", escape(_position(status.get("position") or {}))),
         ("received", rates or "not measured"),
         ("mocap", escape(_mocap(status.get("pose") or {}))),
@@ -123,6 +123,7 @@ def _print_status(status: dict[str, Any], records: int) -> None:
         ("in the shadow", escape(waiting)),
         ("last good", escape(titles.get(status["last_good"], status["last_good"]))),
         ("guard", escape(status["guard"])),
+        ("heard as well", escape("; ".join(status.get("others") or ()))),
         ("records", f"{records} on board"),
     ):
         table.add_row(what, value or "none")
@@ -131,6 +132,17 @@ def _print_status(status: dict[str, Any], records: int) -> None:
         reason = f" ({mission['reason']})" if mission["reason"] not in ("", mission["state"]) else ""
         what = f"{mission['mission']} {mission['trajectory']} {mission['controller']}"
         console.print(escape(f"{what}: {mission['state']}{reason}"), highlight=False)
+
+
+def _several(batteries: list[dict[str, Any]]) -> str:
+    """All of them, where there are several."""
+    if len(batteries) < 2:
+        return ""
+    told = (
+        f"{one['battery']}: {one['voltage']:.2f} V" + (f" ({one['left_out']})" if one["left_out"] else "")
+        for one in batteries
+    )
+    return f"; of {', '.join(told)}"
 
 
 def monitor_command(
