@@ -26,6 +26,7 @@ from trueflight.groundstation.reading.px4_airborne import (
 )
 from trueflight.groundstation.reading.px4_log import Log, Topic
 from trueflight.groundstation.reading.px4_motion import attitude_of, motion_of
+from trueflight.groundstation.reading.px4_resets import without_resets
 from trueflight.groundstation.reading.px4_thrust import commanded_thrust, motor_commands, rotor_speeds
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -65,6 +66,9 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle, mapping: Mapping | None = 
     notes += said
     motion, usable, said = motion_of(log, air, attitude)
     columns |= motion
+    notes += said
+    clean, said = without_resets(log, air)
+    usable &= clean
     notes += said
     inertial, sources, said = _inertial(log, air)
     columns |= inertial

@@ -98,7 +98,7 @@ def _invalid(local: Topic, air: Airborne) -> str | None:
 
 
 def _valid(local: Topic, air: Airborne) -> tuple[np.ndarray, list[str]]:
-    """Where (N,) the estimator vouches for its estimate and did not reset it."""
+    """Where (N,) the estimator vouches for its estimate."""
     notes: list[str] = []
     usable = np.ones(len(air.clock), dtype=bool)
     if flags := [name for name in ("v_xy_valid", "v_z_valid", "xy_valid", "z_valid") if local.has(name)]:
@@ -111,19 +111,6 @@ def _valid(local: Topic, air: Airborne) -> tuple[np.ndarray, list[str]]:
             notes.append(
                 f"{bad:.1f} s in the air without a valid estimate of position or velocity are left out"
             )
-    if counters := [
-        n for n in local.fields if n.endswith("_reset_counter") and not n.startswith(("heading", "dist"))
-    ]:
-        jumped = np.flatnonzero(np.any(np.diff(local.stack(*counters), axis=0) != 0, axis=1))
-        around = np.zeros(len(air.clock), dtype=bool)
-        resets = 0
-        for row in jumped:
-            within = slice(*np.searchsorted(air.clock, [local.t[row], local.t[row + 1]]))
-            around[max(within.start - 1, 0) : within.stop + 1] = True
-            resets += bool(np.any(air.in_air[within]))
-        usable &= ~around
-        if resets:
-            notes.append(f"the estimator reset its position or velocity {_times(resets)} in the air")
     return usable, notes
 
 
@@ -152,7 +139,3 @@ def _slow(log: Log, topic: Topic, air: Airborne, what: str) -> list[str]:
     if rate >= 0.9 * RATE / 2:
         return []
     return [f"{what} is logged at {rate:.0f} Hz and interpolated; {log.faster}"]
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"

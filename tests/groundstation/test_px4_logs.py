@@ -269,13 +269,43 @@ def test_an_estimate_that_jumps_or_is_not_vouched_for_is_left_out(tmp_path):
     fields = dict(fields)
     fields["x"] = ("f", np.asarray(fields["x"][1]) + 3.0 * jump)
     fields["xy_reset_counter"] = ("B", jump.astype(int))
+    fields["delta_xy"] = ("f", np.stack([3.0 * jump, 0.0 * jump], -1))
     fields["v_xy_valid"] = ("?", ~lost)
     log.topics[index] = (name, instance, t, fields)
     flight = read(log, tmp_path)
     at = flight.t[flight.flying]
     assert not np.any((at > 8.99) & (at < 9.01)) and not np.any((at > 12.03) & (at < 12.99))
-    assert any("reset its position or velocity once in the air" in note for note in flight.notes)
+    assert any("the estimator reset its position by 3 m at t = 9.0" in note for note in flight.notes)
     assert any("without a valid estimate" in note for note in flight.notes)
+
+
+@pytest.mark.parametrize(("degrees", "told"), [(60.0, True), (-5.0, False)])
+def test_a_heading_reset_is_told_by_its_counter_and_undone_where_it_is_large(degrees, told, tmp_path):
+    log = log_of("1.15")
+    index = next(i for i, topic in enumerate(log.topics) if topic[0] == "vehicle_attitude")
+    name, instance, t, fields = log.topics[index]
+    after, half = t > BOOT + 14.0, np.radians(degrees) / 2
+    turn = np.where(after[:, None], [np.cos(half), 0.0, 0.0, np.sin(half)], [1.0, 0.0, 0.0, 0.0])
+    q = np.asarray(fields["q"][1])
+    turned = np.stack([
+        turn[:, 0] * q[:, 0] - turn[:, 3] * q[:, 3], turn[:, 0] * q[:, 1] - turn[:, 3] * q[:, 2],
+        turn[:, 0] * q[:, 2] + turn[:, 3] * q[:, 1], turn[:, 0] * q[:, 3] + turn[:, 3] * q[:, 0],
+    ], -1)  # fmt: skip
+    fields = {
+        **fields,
+        "q": ("f", turned),
+        "delta_q_reset": ("f", turn),
+        "quat_reset_counter": ("B", after.astype(int)),
+    }
+    log.topics[index] = (name, instance, t, fields)
+    flight = read(log, tmp_path)
+    said = f"reset its heading by {abs(degrees):.0f} degrees at t = 14.0"
+    assert any(said in note and "quat_reset_counter" in note for note in flight.notes)
+    assert any("was turned by" in note for note in flight.notes) == told
+    assert not np.any(flight.flying[(flight.t > 13.995) & (flight.t < 14.015)])
+    same = np.round(100 * flight.t[flight.flying]).astype(int)
+    aligned = np.abs(np.sum(flight.quaternion[flight.flying] * flown().quaternion[same], axis=1))
+    assert np.degrees(2 * np.arccos(np.clip(aligned.min(), 0, 1))) < (2.0 if told else 6.0)
 
 
 def test_a_flight_without_a_horizontal_estimate_keeps_thrust_and_accelerometer(tmp_path):
