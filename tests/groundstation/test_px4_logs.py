@@ -302,7 +302,7 @@ def test_a_heading_reset_is_told_by_its_counter_and_undone_where_it_is_large(deg
     said = f"reset its heading by {abs(degrees):.0f} degrees at t = 14.0"
     assert any(said in note and "quat_reset_counter" in note for note in flight.notes)
     assert any("was turned by" in note for note in flight.notes) == told
-    assert not np.any(flight.flying[(flight.t > 13.995) & (flight.t < 14.015)])
+    assert not np.any(flight.flying[(flight.t > 13.975) & (flight.t < 14.005)])
     same = np.round(100 * flight.t[flight.flying]).astype(int)
     aligned = np.abs(np.sum(flight.quaternion[flight.flying] * flown().quaternion[same], axis=1))
     assert np.degrees(2 * np.arccos(np.clip(aligned.min(), 0, 1))) < (2.0 if told else 6.0)
