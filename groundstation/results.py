@@ -158,9 +158,27 @@ class SparseFormula:
 
 
 @dataclass(frozen=True)
+class Misfit:
+    """What is left on one axis beyond its noise: `rms` m/s² on `axis` of the "body" or the "world", beside `noise`
+    m/s² of the sensor; four fifths of it between `low` and `high` Hz. `held` is the part of it that the description in
+    `text` holds, 0 where it only tells the band."""
+
+    frame: str
+    axis: str
+    rms: float
+    noise: float
+    low: float
+    high: float
+    held: float
+    text: str
+
+
+@dataclass(frozen=True)
 class Unexplained:
-    """Whether predictable structure is left, its share of the remaining squared error, and what it goes
-    with.
+    """Whether more is left than noise or predictable structure, its share of the remaining squared error, and what it
+    goes with.
+
+    `misfit` tells the axes on which the residual is well above the noise, whether or not it can be predicted.
 
     `p_value` is that of the structure against residuals of the same spectrum without it; `variables` the shares that
     go with each variable, `axes` and `moments` (start, end in s, share) where the structure acts, `lines` the narrow
@@ -177,6 +195,7 @@ class Unexplained:
     lines: tuple[SpectralLine, ...] = ()
     formula: SparseFormula | None = None
     advice: str = ""
+    misfit: tuple[Misfit, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -195,8 +214,9 @@ class EffectVerdict:
     """What the flight says about one effect of the catalogue.
 
     `verdict` is one of missing, possible, not_supported, not_excited, included. `variance_share` is the part
-    of the squared error before that the effect takes away, given the others; `p_value` robust to
-    autocorrelation. `seen_in` is "acceleration" or "rotation": shares and ranks are each among their own.
+    of the squared error before that the effect takes away, given the others; `p_value` robust to autocorrelation.
+    `rests_on` tells what the verdict stands on where more is left than noise. `seen_in` is "acceleration" or
+    "rotation": shares and ranks are each among their own.
     """
 
     name: str
@@ -208,6 +228,7 @@ class EffectVerdict:
     indistinguishable_from: tuple[str, ...]
     advice: str
     seen_in: str = "acceleration"
+    rests_on: str = ""
 
 
 @dataclass(frozen=True)

@@ -193,6 +193,13 @@ class ForceProblem:
         moved = ({**neutral, p.name: p.typical} for p in sizes(effect))
         return np.column_stack([(self.flights.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
 
+    def scale_of_thrust(self, here: Fit) -> tuple[tuple[str, ...], np.ndarray] | None:
+        """The effects that scale the thrust as a whole, and what they change in the prediction (K A,)."""
+        scales = tuple(n for n, e in self.effects.items() if e.scales_rotors)
+        if not scales:
+            return None
+        return scales, self.contribution(here, whole(self.effects[scales[0]]))[:, 0]
+
     def beside(self, here: Fit, choice: Choice) -> Fit | None:
         """The effect beside all that is fitted, by one Gauss-Newton step from the present optimum; None for an effect
         on the history of the command or one that acts by its square, which are far from linear."""

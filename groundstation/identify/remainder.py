@@ -1,4 +1,5 @@
-"""None of these: structure that no known effect explains, found by a flexible learner on held-out blocks.
+"""None of these: what is left beyond the noise (`identify.adequacy`), and structure that no known effect explains,
+found by a flexible learner on held-out blocks.
 
 The learner is ridge regression on an additive spline basis, all products of two variables, and a smooth map of the
 place (random Fourier features, Rahimi & Recht 2007), scored block by block on what it did not see. Being linear in its
@@ -17,6 +18,7 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
 
+from trueflight.groundstation.identify.adequacy import excess, misfits
 from trueflight.groundstation.identify.fitting import BLOCK
 from trueflight.groundstation.identify.sparse import sparse_formula
 from trueflight.groundstation.identify.spectrum import spectral_lines
@@ -49,8 +51,10 @@ PLACE_FEATURES = 40
 def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
     """Look for structure in `residual` (K, A), the used samples of `measurement`; the same every time.
 
-    A constant, lines of the spectrum, and what the flight's variables predict are looked for one beside the other.
+    What is beyond the noise, a constant, lines of the spectrum, and what the flight's variables predict are looked for
+    one beside the other.
     """
+    beyond = misfits(measurement, residual)
     total = float(np.sum(residual**2))
     constant = _constant(measurement, residual)
     lines = spectral_lines(measurement, residual)
@@ -81,6 +85,10 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
             if part > 0.01
         ]
     where += [f"{h.frequency:.1f} Hz on body {h.axis} ({h.rms:.2f} m/s² RMS): {h.text}" for h in heard]
+    share = float((learnt if structure else 0.0) + sum(c.share for c in constant))
+    courses = [x.text for x in beyond if not (constant and "a constant" in x.text)]
+    # what can be predicted comes first where it is most of what is left
+    where = [*where, *courses] if share > 0.5 else [*courses, *where]
     advice = ""
     if structure:
         advice = _advice(learnt, variables, formula)
@@ -92,9 +100,14 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
         advice = (
             f"no static effect swings at {heard[0].frequency:.1f} Hz: look at mounting, rotors and loop gains"
         )
+    elif beyond:
+        advice = (
+            "nothing that was logged goes with it: look what changed or moved in flight (battery, payload, propellers, "
+            "gusts, the estimator), and fly again to see whether it comes back"
+        )
     return Unexplained(
-        verdict=bool(structure or constant or heard),
-        variance_share=float((learnt if structure else 0.0) + sum(c.share for c in constant)),
+        verdict=bool(structure or constant or heard or beyond),
+        variance_share=max(share, excess(measurement, residual) if beyond else 0.0),
         where=tuple(where),
         p_value=float(min([p, *(c.p_value for c in constant), *(h.p_value for h in heard)])),
         variables=variables,
@@ -103,6 +116,7 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
         lines=lines,
         formula=formula,
         advice=advice,
+        misfit=beyond,
     )
 
 

@@ -111,6 +111,10 @@ class Problem(Measured, Protocol):
     def beside(self, here: Fit, choice: Choice) -> Fit | None:
         """The choice beside all that is fitted `here`, linearised; None where only a fit in full tells."""
 
+    def scale_of_thrust(self, here: Fit) -> tuple[tuple[str, ...], np.ndarray] | None:
+        """The effects that scale the thrust as a whole, and what they change in the prediction (K A,); None where
+        nothing does."""
+
     def matters(self, with_: State, without: State, step: tuple[Choice, ...]) -> bool:
         """Whether what the step adds is large enough to be of interest."""
 

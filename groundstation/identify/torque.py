@@ -255,6 +255,9 @@ class TorqueProblem:
         """None: a fit in full takes no longer."""
         return None
 
+    def scale_of_thrust(self, here: Fit) -> None:
+        """None: a gain about each axis is fitted beside every effect."""
+
     def matters(self, with_: State, without: State, step: tuple[Choice, ...]) -> bool:
         """Whether each effect of the step has a parameter larger than `MATERIAL_SIZE` of its typical size."""
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from trueflight.groundstation.identify.doubt import Weighing
 from trueflight.groundstation.identify.fitting import (
     Fit,
     MeasuredFlights,
@@ -119,7 +120,9 @@ def _report(search: Search, found: State, everything: Search, rotation: Rotation
     problem, entire = _force(search), _force(everything)
     here = everything.state(found.choices).fit
     m, base = entire.flights.measurements[0], entire.base
-    verdicts, rate_terms = _verdicts(search, found, here, entire, rotation)
+    remains = unexplained(m, here.residual)
+    doubt = Weighing(entire, here, m.noise[list(m.axes)]) if remains.misfit else None
+    verdicts, rate_terms = _verdicts(search, found, here, entire, rotation, doubt)
     left = float(np.sqrt(here.sse / entire.samples))
     final = model_of(here, base)
     shift = [float(here.estimate[i]) for i, f in enumerate(here.free) if f.nuisance]
@@ -140,7 +143,7 @@ def _report(search: Search, found: State, everything: Search, rotation: Rotation
         else float(np.sqrt(after / held_out.measured().size)),
         clock_shift=shift[0] - problem.flights.vehicle.command_delay if shift else None,
         effects=tuple(verdicts),
-        unexplained=unexplained(m, here.residual),
+        unexplained=remains,
         left_out=m.left_out,
         rotational=rotation.rms,
     )
@@ -152,7 +155,12 @@ def _force(search: Search) -> ForceProblem:
 
 
 def _verdicts(
-    search: Search, found: State, here: Fit, entire: ForceProblem, rotation: RotationalFindings
+    search: Search,
+    found: State,
+    here: Fit,
+    entire: ForceProblem,
+    rotation: RotationalFindings,
+    doubt: Weighing | None,
 ) -> tuple[list[EffectVerdict], list[Term]]:
     """The verdicts on all effects of the catalogue, and the terms of what the body rates show."""
     problem, base = _force(search), entire.base
@@ -160,7 +168,7 @@ def _verdicts(
     scale = Scale(
         before * problem.samples, lambda share: f": {np.sqrt(max(share, 0.0) * before):.3f} m/s² RMS"
     )
-    named, absent = judge(search, found, here, scale, lambda name: _seen_as(problem, name, here))
+    named, absent = judge(search, found, here, scale, lambda name: _seen_as(problem, name, here), doubt)
     candidates = {c.effect for c in problem.choices}
     others = [
         unmeasured(e, e.lacks(problem.flight))

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from trueflight.groundstation.identify.doubt import Weighing
 from trueflight.groundstation.identify.fitting import Fit
 from trueflight.groundstation.identify.search import Search, State
 from trueflight.groundstation.results import EffectVerdict, ParameterEstimate
@@ -38,10 +39,12 @@ def judge(
     figures: Fit,
     scale: Scale,
     also: Callable[[str], tuple[str, ...]] = lambda _: (),
+    doubt: Weighing | None = None,
 ) -> tuple[list[EffectVerdict], list[EffectVerdict]]:
     """Verdicts on what was found, the largest first, and on the other candidates, in the order of the catalogue.
 
-    `figures` is the fit that values and p-values are taken from, `also` names what else an effect may stand for.
+    `figures` is the fit that values and p-values are taken from, `also` names what else an effect may stand for. With
+    `doubt`, where more is left than noise, an effect is only called missing that is of one size throughout.
     """
     rivals = {c: search.rivals(current, c) for c in current.choices}
     lost = {c: search.without(current, c).fit.sse - current.fit.sse for c in current.choices}
@@ -49,17 +52,20 @@ def judge(
     found = []
     for rank, (share, choice) in enumerate(ranked, 1):
         effect, same = search.problem.effects[choice.effect], rivals[choice]
+        weighed = None if doubt is None else doubt.of(effect.name)
+        sure = not same and (weighed is None or weighed.holds)
         found.append(
             EffectVerdict(
                 effect.name,
-                POSSIBLE if same else MISSING,
+                MISSING if sure else POSSIBLE,
                 rank,
                 float(np.clip(share, 0.0, 1.0)),
                 figures.wald(effect.name),
                 estimates(figures, effect.name),
                 (*same, *effect.aliases, *also(effect.name)),
-                _tell(same, effect) if same else _add(effect),
+                _add(effect) if sure else _tell(same, effect),
                 scale.seen_in,
+                "" if weighed is None else weighed.told,
             )
         )
     absent = dict.fromkeys(c.effect for c in search.problem.choices if c.effect not in current.names)
@@ -147,6 +153,8 @@ def estimates(fitted: Fit, name: str) -> tuple[ParameterEstimate, ...]:
 
 
 def _tell(others: Sequence[str], effect: Effect) -> str:
+    if not others:
+        return f"more is left than noise, which it may stand in for; to see it alone, fly {effect.manoeuvre}"
     return f"to tell it from {', '.join(others)}, fly {effect.manoeuvre}"
 
 

@@ -80,6 +80,7 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
                 "indistinguishable_from": list(e.indistinguishable_from),
                 "advice": e.advice,
                 "seen_in": e.seen_in,
+                "rests_on": e.rests_on,
             }
             for e in d.effects
         ],

@@ -131,8 +131,8 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
         )
     if d.unexplained.verdict:
         console.print(
-            f"Unexplained: {percent(d.unexplained.variance_share)} of what is left can be predicted but fits no known "
-            f"effect: {'; '.join(d.unexplained.where)}. More: groundstation remainder FLIGHT",
+            f"Unexplained: {percent(d.unexplained.variance_share)} of what is left is more than noise and fits no "
+            f"known effect: {'; '.join(d.unexplained.where)}. More: groundstation remainder FLIGHT",
             style="yellow",
         )
     for note in d.flight.notes:
@@ -141,10 +141,12 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
         console.print(f"[dim]Looked for and not there:[/dim] {', '.join(absent)}", highlight=False)
     for e in d.effects:
         if e.verdict == "missing":
-            console.print(f"[bold]{e.name}[/bold]: {e.advice}", highlight=False)
+            rests = f"; {e.rests_on}" if e.rests_on else ""
+            console.print(f"[bold]{e.name}[/bold]: {e.advice}{rests}", highlight=False)
     for e in d.effects:
         if e.verdict in ("possible", "not_excited") and e.advice:
-            console.print(f"[dim]{SAID[e.verdict]}[/dim] {e.name}: {e.advice}", highlight=False)
+            rests = f"; {e.rests_on}" if e.rests_on else ""
+            console.print(f"[dim]{SAID[e.verdict]}[/dim] {e.name}: {e.advice}{rests}", highlight=False)
 
 
 def _parameters(e: EffectVerdict) -> str:

@@ -62,7 +62,8 @@ def test_slow_wander_and_bursts_are_no_structure() -> None:
             a = np.exp(-period / correlation)
             coloured = signal.lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], noise, axis=0)
             residual = size * coloured + rng.normal(0.0, 0.05, (n, 3))
-            alarms += unexplained(m, residual[m.used]).verdict
+            left = unexplained(m, residual[m.used])
+            alarms += bool(left.variables or left.formula or left.lines)
     assert alarms <= 2
 
 

@@ -1,0 +1,59 @@
+"""What no static effect explains is told as such, and nothing that stands in for it is called missing."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated import simulated
+
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.results import Diagnosis
+from trueflight.models.flight import Flight
+from trueflight.models.frames import rotate_inverse
+from trueflight.models.model import rigid_body_model
+
+
+def said_of(flight: Flight) -> Diagnosis:
+    return diagnose(flight, rigid_body_model(flight.vehicle))
+
+
+def test_a_swinging_load_is_told_by_frequency_and_axis_and_nothing_is_called_missing() -> None:
+    flight = simulated(3, "none")
+    t = flight.t - flight.t[0]
+    size = 0.6 * np.exp(-(t % 20.0) / 8.0)
+    pull = np.stack([size * np.cos(2 * np.pi * 0.6 * t), size * np.sin(2 * np.pi * 0.6 * t), 0.0 * t], axis=1)
+    found = said_of(
+        replace(flight, specific_force=flight.specific_force + rotate_inverse(flight.quaternion, pull))
+    )
+    assert found.named("missing") == ()
+    assert found.unexplained.verdict
+    assert {(x.frame, x.axis) for x in found.unexplained.misfit} == {("world", "x"), ("world", "y")}
+    for x in found.unexplained.misfit:
+        told = re.search(r": ([0-9.]+) Hz", x.text)
+        assert told and float(told[1]) == pytest.approx(0.6, abs=1.0 / flight.duration), x.text
+        assert x.rms == pytest.approx(np.sqrt(np.mean(pull[:, 0] ** 2)), rel=0.25)
+
+
+def test_a_payload_that_falls_is_told_with_its_moment_and_no_curve_is_called_missing() -> None:
+    flight = simulated(3, "none")
+    t = flight.t - flight.t[0]
+    found = said_of(replace(flight, thrust_command=np.where(t < 25.0, 1.15, 1.0) * flight.thrust_command))
+    assert set(found.named("missing")) <= {"thrust_gain"}
+    assert found.unexplained.verdict
+    first = found.unexplained.misfit[0]
+    assert (first.axis, first.noise) == ("z", pytest.approx(0.05, abs=0.01))
+    for effect in found.effects:
+        assert bool(effect.rests_on) == (effect.rank is not None), effect.name
+    named = [e for e in found.effects if e.name in found.named("possible") and e.rests_on]
+    assert named and all("%" in e.rests_on for e in named)
+
+
+def test_a_misfit_is_judged_axis_by_axis() -> None:
+    flight = simulated(3, "none")
+    rng = np.random.default_rng(0)
+    buffeted = np.convolve(rng.normal(0.0, 1.0, len(flight)), np.ones(40) / 40, mode="same")
+    force = flight.specific_force + 2.0 * buffeted[:, None] * [0.0, 1.0, 0.0]
+    found = said_of(replace(flight, specific_force=force))
+    assert [(x.frame, x.axis) for x in found.unexplained.misfit] == [("body", "y")]
+    assert found.named("missing") == ()
