@@ -17,7 +17,7 @@ ALLOWED = {
     "groundstation": {
         "trueflight.groundstation", "torch", "control", "scipy", "statsmodels", "rerun", "pyarrow", "pyulog", "onnx",
         "onnxruntime", "mcap", "mcap_ros2", "google", "zenoh", "jinja2", "markupsafe", "matplotlib", "pandas", "dask",
-        "distributed", "cryptography",
+        "distributed", "cryptography", "threadpoolctl",
     },
     "sim_bridge": {
         "trueflight.sim_bridge", "trueflight.companion", "mujoco", "pymavlink", "scipy", "mcap", "google",

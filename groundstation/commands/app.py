@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import typer
+from threadpoolctl import threadpool_limits
 
 from trueflight.groundstation.commands import (
     bound,
@@ -65,7 +66,8 @@ choosing.offer_sources(app)
 
 def main() -> None:
     """Entry point of the `groundstation` program."""
-    run_command_line(app)
+    with threadpool_limits(1, user_api="blas"):  # numpy and scipy are loaded by now; see identify/translation.py
+        run_command_line(app)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from trueflight.groundstation.identify.doubt import Weighing
 from trueflight.groundstation.identify.fitting import (
@@ -59,7 +60,17 @@ def diagnose(
 
     Raises `InputError` where the flight lacks the columns for any comparison, or is too short.
     """
+    with threadpool_limits(1, user_api="blas"):  # its products are small: threads wait for each other and compute less
+        return _diagnose(flight, base, validation, bandwidth, progress)
 
+
+def _diagnose(
+    flight: Flight,
+    base: Model,
+    validation: Flight | None,
+    bandwidth: float | None,
+    progress: Callable[[str], None],
+) -> Diagnosis:
     def measured(*measurements: Measurement) -> MeasuredFlights:
         return MeasuredFlights(measurements, base.effects_directory, base.network_chain())
 

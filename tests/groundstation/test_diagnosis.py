@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
+from trueflight.groundstation.commands import app as program
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.results import Diagnosis
@@ -114,6 +116,20 @@ def test_included_effect_is_not_looked_for_again() -> None:
     result = diagnose(flight, base)
     assert [e.verdict for e in result.effects if e.name == "rotor_drag"] == ["included"]
     assert result.named("missing") == ()
+
+
+def test_numpy_and_scipy_compute_in_one_thread_here_and_in_the_program(monkeypatch) -> None:
+    def threads() -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    flight = read_flight(SAMPLES / "rotorpy" / "nothing_hidden" / "identify.parquet")
+    seen: list[set[int]] = []
+    monkeypatch.setattr(program, "run_command_line", lambda app: seen.append(threads()))
+    with threadpool_limits(2, user_api="blas"):
+        diagnose(flight, rigid_body_model(flight.vehicle), progress=lambda _: seen.append(threads()))
+        program.main()
+        assert threads() == {2}
+    assert len(seen) > 2 and all(found == {1} for found in seen)
 
 
 def test_hover_cannot_show_drag_and_says_what_would() -> None:
