@@ -66,7 +66,8 @@ choosing.offer_sources(app)
 
 def main() -> None:
     """Entry point of the `groundstation` program."""
-    with threadpool_limits(1, user_api="blas"):  # numpy and scipy are loaded by now; see identify/translation.py
+    # numpy and scipy are loaded by now; identify/translation.py tells why
+    with threadpool_limits(1, user_api="blas"):
         run_command_line(app)
 
 

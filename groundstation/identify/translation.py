@@ -60,7 +60,8 @@ def diagnose(
 
     Raises `InputError` where the flight lacks the columns for any comparison, or is too short.
     """
-    with threadpool_limits(1, user_api="blas"):  # its products are small: threads wait for each other and compute less
+    # Its products are small: threads would wait for each other more than they compute.
+    with threadpool_limits(1, user_api="blas"):
         return _diagnose(flight, base, validation, bandwidth, progress)
 
 

@@ -96,15 +96,21 @@ class Process:
             self.lines.append(line.rstrip())
 
 
+BRISK = ("COM_OF_LOSS_T=5", "COM_DISARM_LAND=0.2", "MPC_LAND_SPEED=2")
+"""The stand-in's parameters for tests of other things: it waits long for a setpoint that a busy machine delays, and
+comes down fast."""
+
+
 class Bridge(Process):
-    """`sim-bridge run`, sending to `port`."""
+    """`sim-bridge run`, sending to `port`; `flags` come after `BRISK`, and the last word counts."""
 
     def __init__(self, port: int, *flags: str) -> None:
         self.port, self.pilot_port = free_port(), free_port()
         program = "from trueflight.sim_bridge.cli import main; main()"
         super().__init__(
             ["-c", program, "run", "--vehicle", str(VEHICLE), "--mavlink", f"udpout:127.0.0.1:{port}"]
-            + ["--port", str(self.port), "--pilot-port", str(self.pilot_port), *flags]
+            + ["--port", str(self.port), "--pilot-port", str(self.pilot_port)]
+            + [*(text for parameter in BRISK for text in ("--param", parameter)), *flags]
         )
         self.ready()
 

@@ -42,7 +42,7 @@ def refused(*arguments: object) -> str:
 @pytest.fixture
 def bridge() -> Iterator[tuple[Bridge, int]]:
     port = free_port()
-    bridge = Bridge(port, "--param", "EKF2_PREDICT_US=10000")
+    bridge = Bridge(port, "--param", "EKF2_PREDICT_US=10000", "--param", "COM_OF_LOSS_T=1")
     yield bridge, port
     bridge.end()
 

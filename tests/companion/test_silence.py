@@ -48,9 +48,11 @@ def link() -> Iterator[tuple[Bridge, Wiretap]]:
     ("how", "number"),
     [
         ("asleep", signal.SIGUSR1),
-        ("busy", signal.SIGUSR1),
-        ("stopped", signal.SIGSTOP),
         ("killed", signal.SIGKILL),
+        pytest.param(
+            "busy", signal.SIGUSR1, marks=pytest.mark.long
+        ),  # both hang in tests/faults/test_hangs.py
+        pytest.param("stopped", signal.SIGSTOP, marks=pytest.mark.long),
     ],
 )
 def test_trouble_in_flight_means_silence_and_the_failsafe(
@@ -61,6 +63,10 @@ def test_trouble_in_flight_means_silence_and_the_failsafe(
     try:
         companion.fly(trajectory="hover", parameters={"duration": 600.0})
         companion.phase("mission")
+        count = len(companion.ticks)
+        wait_for(
+            lambda: len(companion.ticks) > count + 120, "more than the second that a killed recorder may lose"
+        )
         assert tap.mode == "OFFBOARD"
         begin = time.monotonic()
         companion.send(number)
@@ -73,7 +79,7 @@ def test_trouble_in_flight_means_silence_and_the_failsafe(
     (path,) = companion.records.glob("*.mcap")
     record = read_record(path)
     assert record.truncated
-    assert (record.ticks["phase"] == "mission").any() or len(record.ticks["t"]) > 200
+    assert (record.ticks["phase"] == "mission").any(), "what was flown until a second ago is in it"
 
 
 def test_a_hang_is_told_to_the_ground(link: tuple[Bridge, Wiretap], tmp_path: Path) -> None:

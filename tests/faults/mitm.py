@@ -82,6 +82,11 @@ class ManInTheMiddle:
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
+    @property
+    def empty(self) -> bool:
+        """Whether nothing that was delayed is still on its way."""
+        return not self._late
+
     def close(self) -> None:
         """Forward nothing any more."""
         self._running = False

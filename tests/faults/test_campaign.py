@@ -1,4 +1,4 @@
-"""The campaign in miniature: those of its parts that no other test flies. `make faults` is the long form."""
+"""The campaign in miniature, among the long tests. `make faults` is the long form of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from promise import Row
 from rig import PATIENT
 from silences import kills
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.long]
 
 
 def broken(rows: list[Row]) -> list[Row]:

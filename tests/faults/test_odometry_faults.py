@@ -30,16 +30,24 @@ ASTRAY = 1.0
 
 @pytest.fixture
 def hovering(link: Link) -> Iterator[Link]:
-    """A hover 1.2 m up, and the vehicle back on the ground afterwards."""
-    identity = link.companion.fly(trajectory="hover", parameters={"duration": 600.0, "height": 1.2})
-    link.companion.phase("mission")
-    time.sleep(0.5)
+    """A hover 1.2 m up, which goes on for the next test where nothing ended it."""
+    if not link.middle.armed or link.companion.ticks[-1].phase != "mission":
+        landed(link)
+        link.companion.fly(trajectory="hover", parameters={"duration": 3600.0, "height": 1.2})
+        link.companion.phase("mission")
+        time.sleep(0.5)
     yield link
     link.middle.fault = nothing
-    time.sleep(0.7)  # what was delayed is through
+    wait_for(lambda: link.middle.empty, "what was delayed to be through")
+
+
+def landed(link: Link) -> None:
+    """No flight and no fault any more, and the vehicle on the ground."""
+    link.middle.fault = nothing
     link.companion.ask("mission", {"command": "abort"})
-    link.companion.done(identity)
     wait_for(lambda: not link.middle.armed, "disarmed")
+    count = len(link.companion.ticks)
+    wait_for(lambda: link.companion.ticks[-1].phase == "idle" and len(link.companion.ticks) > count, "idle")
 
 
 def new_events(link: Link, count: int) -> list[str]:
@@ -162,6 +170,7 @@ def test_age_is_known_from_pings_alone(hovering: Link) -> None:
 
 
 def test_age_stands_in_the_record(link: Link) -> None:
+    landed(link)
     identity = link.companion.fly(trajectory="hover", parameters={"duration": 2.0})
     status = link.companion.done(identity)
     assert status["state"] == "finished", status

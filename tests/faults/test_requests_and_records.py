@@ -31,7 +31,7 @@ SMALL_DISK = (
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Companion, Wiretap]]:
     tap = Wiretap()
-    bridge = Bridge(tap.port, "--speed", SPEED)
+    bridge = Bridge(tap.port, "--speed", SPEED, "--param", f"COM_OF_LOSS_T={OFFBOARD_LOSS}")
     folder = tmp_path_factory.mktemp("companion")
     companion = Companion(folder, tap.companion_port, before=SMALL_DISK)
     yield companion, tap

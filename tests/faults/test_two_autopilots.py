@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from rig import Bridge, Companion, free_port, wait_for
 pytestmark = pytest.mark.realtime
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def two_on_one_port() -> Iterator[int]:
     port = free_port()
     bridges = [Bridge(port, "--param", f"MAV_SYS_ID={system}") for system in (1, 2)]
@@ -41,9 +40,11 @@ def test_the_chosen_one_flies_and_the_other_stays_on_the_ground(
     try:
         companion.fly(trajectory="hover", parameters={"duration": 60.0, "height": 1.0})
         companion.phase("mission")
-        time.sleep(0.5)
-        heights = [tick.position.z for tick in companion.ticks[-30:]]
-        assert min(heights) > 0.8, "one vehicle's odometry throughout"
+        wait_for(lambda: companion.ticks[-1].position.z > 0.8, "the height of the mission")
+        count = len(companion.ticks)
+        wait_for(lambda: len(companion.ticks) > count + 30, "more ticks")
+        heights = [tick.position.z for tick in companion.ticks[count:]]
+        assert min(heights) > 0.5, "one vehicle's odometry throughout: the other stands on the ground"
     finally:
         companion.end()
 

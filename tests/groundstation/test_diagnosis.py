@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import programs
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -26,8 +27,9 @@ BIN = Path(sys.executable).parent
 def fly(tmp_path: Path, *arguments: str) -> Path:
     """A simulated survey flight, by the simulator's own program."""
     record = tmp_path / "flight.mcap"
-    command = [BIN / "sim-bridge", "fly", "--trajectory", "excitation", "--vehicle", VEHICLE, "-o", record]
-    subprocess.run([*map(str, command), *arguments], check=True, capture_output=True, timeout=120)
+    command = ["fly", "--trajectory", "excitation", "--vehicle", VEHICLE, "-o", record]
+    told = programs.run("sim-bridge", *command, *arguments)
+    assert told.returncode == 0, told.stderr
     return record
 
 
@@ -38,13 +40,16 @@ def diagnosis_of(path: Path) -> Diagnosis:
 
 # What the simulator hides, in its own terms, and what must be found: (name, parameter, value, tolerance).
 # Its ground effect has another law (images of all rotors), so only the name is asked for.
+# One of a kind here; test_recovery.py finds every one, at another size.
 HIDDEN = [
     ("thrust_gain:1.08", "thrust_gain", "gain", 1.08, 0.005),
+    ("transport_delay:0.03", "transport_delay", "delay", 0.005 + 0.03, 0.01),
+    ("rotor_drag:0.25", "rotor_drag", "x", 0.25, 0.025),
+]
+MORE = [
     ("thrust_curve:0.6", "thrust_curve", "curvature", 0.6, 0.03),
     ("battery_sag:1.3", "battery_sag", "exponent", 1.3, 0.1),
     ("motor_lag:0.05", "motor_lag", "tau", 0.05, 0.005),
-    ("transport_delay:0.03", "transport_delay", "delay", 0.005 + 0.03, 0.01),
-    ("rotor_drag:0.25", "rotor_drag", "x", 0.25, 0.025),
     ("parasitic_drag:0.1", "parasitic_drag", "x", 0.1, 0.01),
     ("ground_effect:1.6", "ground_effect", "rho", None, None),
     ("accelerometer_bias:0.3", "accelerometer_bias", "x", None, None),
@@ -52,7 +57,9 @@ HIDDEN = [
 
 
 @pytest.mark.parametrize(
-    ("hidden", "name", "parameter", "value", "tolerance"), HIDDEN, ids=[h[1] for h in HIDDEN]
+    ("hidden", "name", "parameter", "value", "tolerance"),
+    [*HIDDEN, *(pytest.param(*more, marks=pytest.mark.long) for more in MORE)],
+    ids=[h[1] for h in (*HIDDEN, *MORE)],
 )
 def test_hidden_effect_is_found(tmp_path, hidden, name, parameter, value, tolerance) -> None:
     result = diagnosis_of(fly(tmp_path, "--hidden", hidden, "--seed", "11"))
@@ -70,7 +77,7 @@ def test_wind_is_found_with_the_drag_it_acts_through(tmp_path) -> None:
     assert set(result.named("missing")) == {"rotor_drag", "wind"}
 
 
-@pytest.mark.parametrize("seed", ["1", "2", "3"])
+@pytest.mark.parametrize("seed", ["1", *(pytest.param(s, marks=pytest.mark.long) for s in ("2", "3"))])
 def test_nothing_hidden_gives_no_alarm(tmp_path, seed: str) -> None:
     result = diagnosis_of(fly(tmp_path, "--hidden", "none", "--seed", seed))
     assert result.named("missing") == result.named("possible") == ()
@@ -88,7 +95,11 @@ def test_flights_of_another_simulator(case: str, missing: tuple[str, ...]) -> No
 
 
 @pytest.mark.parametrize(
-    ("file", "gain"), [("crazyswarm2_log08.csv", 1.44), ("crazyswarm2_log201.csv", 0.0369 / 0.0406)]
+    ("file", "gain"),
+    [
+        ("crazyswarm2_log08.csv", 1.44),
+        pytest.param("crazyswarm2_log201.csv", 0.0369 / 0.0406, marks=pytest.mark.long),
+    ],
 )
 def test_real_crazyflies_thrust_gain_and_drag(file: str, gain: float) -> None:
     # gains of a plain least-squares study of these flights; the payload one is the ratio of the two weights

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime
+import programs
 import pytest
 
 from trueflight.groundstation.evaluate.compare import waterfall
@@ -114,13 +115,7 @@ def test_rigid_body_correction_is_small_angle_error(flight) -> None:
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(BIN / "groundstation"), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    return programs.run("groundstation", *arguments)
 
 
 BAD = [

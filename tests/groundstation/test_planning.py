@@ -41,7 +41,7 @@ def diagnosis_of(path, hidden, seed, flown):
     ],
     ids=["drag in a circle", "gain in a hover"],
 )
-@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.long)])
 def test_the_planned_flight_tells_what_the_first_one_could_not(
     tmp_path, hidden, truth, rivals, first, seed
 ) -> None:

@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
+import programs
 import pytest
 
 from trueflight.groundstation import report
@@ -268,10 +269,7 @@ def test_a_report_that_cannot_be_written_is_told(tmp_path):
 
 
 def run(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "trueflight.groundstation.commands.app", *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=200,
-    )  # fmt: skip
+    return programs.run("groundstation", *arguments, cwd=cwd)
 
 
 def test_a_flight_without_accelerometer_position_or_attitude_has_a_report(tmp_path):

@@ -33,7 +33,7 @@ DRAG = {"one": 0.20, "two": 0.30}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Ten short flights each of two vehicles with different drag, and two files that are no flights."""
+    """Five short flights each of two vehicles with different drag, and two files that are no flights."""
     root = tmp_path_factory.mktemp("fleet")
     believed = load_vehicle(VEHICLE)
     design = load_design(VEHICLE.with_name("design.json"), believed)
@@ -41,7 +41,7 @@ def folder(tmp_path_factory):
     for name, drag in DRAG.items():
         vehicle = replace(believed, name=name)
         (root / name).mkdir()
-        for number in range(1, 11):
+        for number in range(1, 6):
             hidden = choose([f"rotor_drag:{drag + 0.005 * number}"], vehicle, 1)
             plan = Plan(vehicle, replace(design, vehicle=name), flown, hidden, number, noise=Noise())
             record(plan, root / name / f"2026-05-{number:02d}.mcap")
@@ -66,22 +66,22 @@ def test_every_flight_is_a_row_and_a_bad_file_is_skipped(folder, tmp_path, capsy
     )
     assert code == 0
     result = valid("groundstation survey", json.loads(out))
-    assert len(result["flights"]) == 22
+    assert len(result["flights"]) == 12
     failed = [r for r in result["flights"] if r["error"]]
     assert {os.path.basename(r["file"]) for r in failed} == {"notes.csv", "cut.mcap"}
     assert all("\n" not in r["error"] for r in failed)
     fleet = result["fleet"]
-    assert (fleet["flights"], fleet["failed"], fleet["vehicles"]) == (22, 2, ["one", "two"])
+    assert (fleet["flights"], fleet["failed"], fleet["vehicles"]) == (12, 2, ["one", "two"])
     drag = next(e for e in fleet["effects"] if e["effect"] == "rotor_drag")
-    assert drag["counts"]["missing"] >= 19
+    assert drag["counts"]["missing"] >= 9
     spread = next(p for p in fleet["parameters"] if (p["effect"], p["parameter"]) == ("rotor_drag", "x"))
     # two vehicles whose drag is 0.1 1/s apart, and 0.005 1/s more a day
     assert spread["between_vehicles"] == pytest.approx(0.1 / np.sqrt(2.0), rel=0.2)
     assert spread["between_flights"] < 0.3 * spread["between_vehicles"]
-    assert spread["trend_per_day"] == pytest.approx(0.005, abs=0.0012)
+    assert spread["trend_per_day"] == pytest.approx(0.005, abs=0.003)
 
     table = parquet.read_table(tmp_path / "survey.parquet").to_pydict()
-    assert len(table["file"]) == 22
+    assert len(table["file"]) == 12
     assert table["verdict_rotor_drag"].count("missing") == drag["counts"]["missing"]
     assert json.loads((tmp_path / "fleet.json").read_text()) == fleet
 
@@ -96,7 +96,7 @@ def test_every_flight_is_a_row_and_a_bad_file_is_skipped(folder, tmp_path, capsy
     code, out, _ = run(capsys, monkeypatch, "survey", folder, "--save", tmp_path, "--jobs", 1)
     assert code == 0
     assert len(seen) < 8
-    assert "20 of 22 flights could be used, of 2 vehicles" in " ".join(out.split())
+    assert "10 of 12 flights could be used, of 2 vehicles" in " ".join(out.split())
 
 
 def test_a_worker_that_dies_costs_its_file_only(folder, tmp_path, monkeypatch) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import programs
 import pytest
 
 from trueflight.groundstation.evaluate.compare import compare, waterfall
@@ -36,10 +37,8 @@ QUICK = replace(OWN, epochs=12, batch=256)
 def fly(folder: Path, name: str, *options: str) -> Path:
     path = folder / f"{name}.mcap"
     hidden = ["--hidden", "rotor_drag:0.4", "--hidden", "battery_sag:1.8", "--hidden", "thrust_gain:1.08"]
-    subprocess.run(
-        [BIN / "sim-bridge", "fly", "--vehicle", VEHICLE, "--seed", "5", "-o", path, *hidden, *options],
-        check=True, capture_output=True, timeout=120,
-    )  # fmt: skip
+    told = programs.run("sim-bridge", "fly", "--vehicle", VEHICLE, "--seed", 5, "-o", path, *hidden, *options)
+    assert told.returncode == 0, told.stderr
     return path
 
 
@@ -274,10 +273,7 @@ def test_inference_of_a_network_takes_microseconds_not_milliseconds(trained, fli
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(BIN / "groundstation"), *map(str, arguments)],
-        capture_output=True, text=True, check=False, timeout=180,
-    )  # fmt: skip
+    return programs.run("groundstation", *arguments)
 
 
 def test_train_makes_a_version_that_every_other_command_uses(folder, tmp_path) -> None:

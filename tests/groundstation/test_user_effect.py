@@ -1,13 +1,13 @@
 """A user's effect, one file from the template, gets all that the catalogue's own effects get."""
 
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
+import programs
 import pytest
 from simulated import simulated
 
@@ -40,8 +40,7 @@ def flight_with_tether(tmp_path_factory) -> Path:
 
 
 def run(*arguments: object) -> str:
-    command = [str(BIN / "python"), "-m", "trueflight.groundstation.commands.app", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=180)
+    done = programs.run("groundstation", *arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -1,11 +1,11 @@
 """A vehicle file drafted from a log: what the log tells, where from, and what it cannot tell."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import programs
 import pytest
 from px4_layouts import flown, log_of
 
@@ -24,7 +24,7 @@ def drafted(log, tmp_path, mass=None):
 
 
 def groundstation(*arguments):
-    return subprocess.run([BIN / "groundstation", *map(str, arguments)], capture_output=True, text=True)
+    return programs.run("groundstation", *arguments)
 
 
 def test_geometry_hover_and_voltage_come_from_the_log(tmp_path):

@@ -243,6 +243,7 @@ tf.simulate("a.mcap", hidden=["rotor_drag:0.3"])
 """
 
 
+@pytest.mark.long  # mypy reads all of the package anew
 def test_a_users_script_type_checks_strictly_and_a_wrong_one_does_not(tmp_path: Path) -> None:
     (tmp_path / "right.py").write_text(SCRIPT)
     (tmp_path / "wrong.py").write_text(SCRIPT + "\nrms = found.missing\ntf.compare('log.ulg')\n")
