@@ -41,7 +41,7 @@ def whole_file(path: str | Path, what: str, advice: str = "", new: bool = False)
         if new and place.exists():
             raise FileExistsError(place)
         place.parent.mkdir(parents=True, exist_ok=True)
-        _remove_left_over(place)
+        _remove_left_over(place, every=new)
         with _folder_beside(place) as folder:
             partial = folder / place.name
             yield partial
@@ -84,21 +84,25 @@ def _folder_beside(place: Path) -> Iterator[Path]:
     lock = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
         with contextlib.suppress(OSError):  # without locks, what a killed writer leaves stays
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, fcntl.LOCK_EX)  # who looks whether it is left over holds it for a moment
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         os.close(lock)
 
 
-def _remove_left_over(place: Path) -> None:
-    """Remove unfinished files of this place whose writers have ended."""
-    for name in glob.iglob(glob.escape(str(place.parent / _begin(place))) + "????????.part"):
+def _remove_left_over(place: Path, every: bool) -> None:
+    """Remove unfinished files of this place whose writers have ended. With `every` also those of other places in its
+    folder: a place that is written once only is never written again where the kill came just after its file was whole.
+    An empty folder of another place may be one whose writer has not locked it yet."""
+    mine = _begin(place)
+    begin = f"{glob.escape(str(place.parent))}/{'.*.' if every else glob.escape(mine)}"
+    for name in glob.iglob(f"{begin}????????.part"):
         with contextlib.suppress(OSError):
             lock = os.open(name, os.O_RDONLY | os.O_CLOEXEC)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if Path(name).is_dir():
+                if Path(name).is_dir() and (Path(name).name.startswith(mine) or any(Path(name).iterdir())):
                     shutil.rmtree(name, ignore_errors=True)
             finally:
                 os.close(lock)

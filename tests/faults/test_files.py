@@ -49,6 +49,20 @@ def test_nothing_is_led_astray(script: str, words: list[str]) -> None:
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
 
 
+def test_what_a_writer_left_that_was_killed_just_after_its_version_was_whole_is_removed(
+    tmp_path: Path,
+) -> None:
+    """The next version has another number, so nobody writes that one again; who writes at this moment is left alone."""
+    model = rigid_body_model(load_vehicle(QUAD5 / "vehicle.toml"))
+    made, path = save(tmp_path, model, None)
+    left, begun = (path.with_name(f".{path.name}.{token}.part") for token in ("01234567", "89abcdef"))
+    left.mkdir()
+    (left / path.name).write_text("whole")
+    begun.mkdir()
+    save(tmp_path, made, made)
+    assert not left.exists() and begun.exists()
+
+
 def test_what_an_older_version_left_unfinished_is_passed_by(tmp_path: Path, caplog) -> None:
     vehicle = load_vehicle(QUAD5 / "vehicle.toml")
     drag = Term("rotor_drag", {"x": 0.3, "y": 0.4})

@@ -81,12 +81,14 @@ class Px4Peer:
             self.waiting += self.link.parse_buffer(data) or []
 
     def next(self) -> Sensed:
-        """The next HIL_SENSOR and what comes with it, up to the one after or to the end of what has arrived."""
+        """The next HIL_SENSOR and what comes with it, up to the one after or to the end of what has arrived; what of
+        the step before arrives later than that is among it."""
         self._receive()
+        late = []
         while self.waiting[0].get_type() != "HIL_SENSOR":
-            self.waiting.pop(0)
+            late.append(self.waiting.pop(0))
             self._receive()
-        step = Sensed(self.waiting.pop(0))
+        step = Sensed(self.waiting.pop(0), late)
         while self.waiting and self.waiting[0].get_type() != "HIL_SENSOR":
             step.others.append(self.waiting.pop(0))
         return step
