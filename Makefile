@@ -23,8 +23,9 @@ $(VENV)/.installed: pyproject.toml
 demo: setup
 	$(BIN)/groundstation demo --seed $(SEED)
 
-# WORKERS processes: one flies in real time, the others compute; tests/conftest.py tells who runs what.
-WORKERS ?= 2
+# WORKERS processes: one flies in real time, which is mostly waiting, the others compute (tests/conftest.py). Three
+# keep two cores busy.
+WORKERS ?= 3
 PYTEST := $(BIN)/pytest -n $(WORKERS) --dist loadgroup --no-loadscope-reorder
 
 test: setup lint

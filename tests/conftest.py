@@ -17,6 +17,9 @@ settings.register_profile(
 
 FLIGHT = "flight"
 """Tests in real time: one worker runs them one after the other, so that none starves another."""
+COMPUTING = 5
+"""Steps of niceness of the other workers: as many as run on each core leave a flight the greater part of it."""
+_begun: list[str] = []
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -33,3 +36,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.path.parent.name != "groundstation",
         )
     )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A worker that begins with anything else than flights gives way to the one that flies."""
+    if "PYTEST_XDIST_WORKER" in os.environ and not _begun:
+        _begun.append(item.nodeid)
+        if item.get_closest_marker("realtime") is None:
+            os.nice(COMPUTING)

@@ -125,7 +125,8 @@ def test_no_flight_without_a_position_and_every_refusal_tells_what_was_received(
         assert "constant position" in rows["position"]["why"]
         assert "0.02 m" in rows["position"]["why"]
         assert "known to 2 m" in rows["position"]["wanted"]
-        assert "PX4 would arm" not in rows["arming"]["value"] or "without a position" in rows["arming"]["why"]
+        assert rows["arming"]["value"] == "PX4 would arm"
+        assert "without a position, the companion does not" in rows["arming"]["why"]
 
         flying = Companion(tmp_path, port)
         try:
