@@ -63,6 +63,17 @@ COLUMNS: dict[str, tuple[tuple[str, ...], str, str]] = {
     ),
 }
 """Every column a flight may have, besides `t` (s). Scalars have shape (N,), the others (N, k)."""
+EACH_ROTOR = ("rotor_speed", "motor_command")
+"""Columns of one value a rotor; `COLUMNS` names those of four."""
+MOST_ROTORS = 12
+"""Rotors of a flight: PX4 allocates no more."""
+
+
+def column_names(attribute: str, width: int) -> tuple[str, ...]:
+    """Names in the project's own CSV of the columns (N, `width`) of an attribute."""
+    if attribute in EACH_ROTOR:
+        return tuple(f"{attribute}_{i + 1}" for i in range(width))
+    return COLUMNS[attribute][0]
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ from trueflight.groundstation.reading.faults import about_z
 from trueflight.groundstation.reading.sources import Sources, sources_in
 from trueflight.groundstation.reading.table import Table
 from trueflight.models.errors import InputError
-from trueflight.models.flight import COLUMNS
+from trueflight.models.flight import COLUMNS, EACH_ROTOR, MOST_ROTORS
 from trueflight.models.frames import (
     enu_flu_from_ned_frd,
     enu_from_ned,
@@ -260,7 +260,8 @@ def corrected(
     whole = Mapping(mapping.source, mapping.frame, entries)
     for name in entries:
         names, unit, _ = COLUMNS[name]
-        values = _in_unit(whole, name, columns[name], vehicle, len(names), unit)
+        count = columns[name].shape[1] if name in EACH_ROTOR else len(names)
+        values = _in_unit(whole, name, columns[name], vehicle, count, unit)
         out[name] = _in_frame(whole, name, values)
     return _mended(mapping, t, out)
 
@@ -328,6 +329,8 @@ def _quantity(
     entry = mapping.quantities[name]
     names = entry.get("columns", entry.get("column"))
     names = [names] if isinstance(names, str) else names
+    if name in EACH_ROTOR and isinstance(names, list) and count < len(names) <= MOST_ROTORS:
+        count = len(names)
     if not isinstance(names, list) or len(names) != count or not all(isinstance(n, str) for n in names):
         what = 'column = "..."' if count == 1 else f"columns = [...] with {count} names"
         raise InputError(f"{mapping.source}: [{name}] needs {what}, it has {shown(names)}")

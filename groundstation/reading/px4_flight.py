@@ -194,15 +194,19 @@ def _commands(log: Log, air: Airborne, vehicle: Vehicle) -> tuple[dict[str, np.n
             "it is scaled so that its median is hover_thrust: a wrong mass or thrust gain cannot show"
         )
     out["thrust_command"] = values
+    if (motors := motor_commands(log.of("motor_command"), first, last, count)) is not None:
+        commands = np.stack([_interpolated(motors.t, c, clock) for c in motors.commands.T], -1)
+        out["motor_command"] = np.where(armed[:, None], np.nan_to_num(commands), 0.0)
+    esc = rotor_speeds(log.of("rotor_speed"), first, last, count)
+    if esc is not None and esc[2] >= 10.0:
+        out["rotor_speed"] = np.stack([np.interp(clock, esc[0], c) for c in esc[1].T], -1)
     if count != 4:
-        notes.append(f"{count} motors: the collective is read, what single motors did is not")
-    else:
-        if (motors := motor_commands(log.of("motor_command"), first, last, 4)) is not None:
-            commands = np.stack([_interpolated(motors.t, c, clock) for c in motors.commands.T], -1)
-            out["motor_command"] = np.where(armed[:, None], np.nan_to_num(commands), 0.0)
-        esc = rotor_speeds(log.of("rotor_speed"), first, last, 4)
-        if esc is not None and esc[2] >= 10.0:
-            out["rotor_speed"] = np.stack([np.interp(clock, esc[0], c) for c in esc[1].T], -1)
+        notes.append(f"{count} motors: effects of single rotors are looked for with four only")
+    if vehicle.rotor_positions and len(vehicle.rotor_positions) != count:
+        notes.append(
+            f"{count} motors flew, and the vehicle file has {len(vehicle.rotor_positions)} rotor_positions: correct "
+            "them (--draft-vehicle writes those of CA_ROTOR*)"
+        )
     rates = log.of("body_rate_command").topic("vehicle_rates_setpoint", "roll", "pitch", "yaw")
     if rates is not None and rates.rate_within(first, last) >= 0.2 * RATE:
         wanted = flu_from_frd(rates.stack("roll", "pitch", "yaw"))

@@ -13,10 +13,10 @@ import numpy as np
 
 from trueflight.groundstation.reading.csv_text import read_csv_text
 from trueflight.models.errors import InputError
-from trueflight.models.flight import COLUMNS
+from trueflight.models.flight import COLUMNS, MOST_ROTORS, column_names
 from trueflight.models.outside import shown, unreadable
 
-OWN_NAMES = tuple(name for names, _, _ in COLUMNS.values() for name in names)
+OWN_NAMES = tuple(name for attribute in COLUMNS for name in column_names(attribute, MOST_ROTORS))
 """Names of all columns of the project's own CSV, besides `t` and `flying`."""
 NOTHING = [
     "",
@@ -117,8 +117,10 @@ def own_columns(table: Table) -> dict[str, np.ndarray]:
     Raises `InputError` for a group of which some columns are missing, or a file without any known column.
     """
     groups: dict[str, np.ndarray] = {}
-    for attribute, (names, _, what) in COLUMNS.items():
-        present = [name for name in names if name in table.columns]
+    for attribute, (four, _, what) in COLUMNS.items():
+        every = column_names(attribute, MOST_ROTORS)
+        present = [name for name in every if name in table.columns]
+        names = every[: max(len(four), every.index(present[-1]) + 1 if present else 0)]
         if not present:
             continue
         if len(present) < len(names):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from trueflight.models.errors import InputError
-from trueflight.models.flight import COLUMNS, Flight
+from trueflight.models.flight import COLUMNS, Flight, column_names
 from trueflight.models.record import vehicle_to_toml
 from trueflight.models.whole_file import whole_file, write_whole
 
@@ -43,11 +43,12 @@ def write_flight(flight: Flight, path: Path) -> Path:
 def own_table(flight: Flight) -> dict[str, np.ndarray]:
     """The flight's columns by the names of the project's own format, rounded to nine digits."""
     out: dict[str, np.ndarray] = {"t": _rounded(flight.t)}
-    for attribute, (names, _, _) in COLUMNS.items():
+    for attribute in COLUMNS:
         values = getattr(flight, attribute)
         if values is None:
             continue
-        for name, column in zip(names, values.reshape(len(flight), -1).T, strict=True):
+        columns = values.reshape(len(flight), -1).T
+        for name, column in zip(column_names(attribute, len(columns)), columns, strict=True):
             out[name] = _rounded(column)
     if flight.flying is not None:
         out["flying"] = flight.flying.astype(np.int8)

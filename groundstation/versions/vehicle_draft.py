@@ -153,10 +153,10 @@ def _rotors(log: Log, simulated: bool) -> tuple[Line, ...]:
     keys = [f"CA_ROTOR{i}_{axis}" for i in range(count) for axis in ("PX", "PY", "PZ", "KM")]
     found = [log.parameter(key) for key in keys]
     radius = Line("rotor_radius", "0.1", "m", "not known to PX4: MEASURE, half a propeller's diameter", False)
-    if count != 4 or any(value is None for value in found):
+    if any(value is None for value in found):
         airframe = log.parameter("SYS_AUTOSTART")
         why = (
-            f"the vehicle has {count} motors, the file describes four: leave it out"
+            f"the log does not tell where its {count} motors are (CA_ROTOR*): MEASURE, one row a motor"
             if count != 4
             else "not in the log: before 1.13 a mixer file stands for it "
             f"(SYS_AUTOSTART {airframe or 0:.0f}, MAV_TYPE {log.parameter('MAV_TYPE') or 0:.0f}): MEASURE. Shown is "
@@ -168,20 +168,20 @@ def _rotors(log: Log, simulated: bool) -> tuple[Line, ...]:
             Line("rotor_positions", shown, "m, FLU", why, False, False),
             Line("rotor_directions", "[1, 1, -1, -1]", "1: counter-clockwise from above", why, False, False),
         )
-    values = np.array(found, dtype=float).reshape(4, 4)
+    values = np.array(found, dtype=float).reshape(count, 4)
     positions = values[:, :3] * [1.0, -1.0, -1.0] + 0.0
     directions = np.where(values[:, 3] >= 0, 1, -1)
-    relative = bool(np.allclose(np.abs(positions[:, :2]), np.abs(positions[0, 0]), atol=1e-6)) and (
-        abs(positions[0, 0]) >= 0.5
-    )
+    square = np.allclose(np.abs(positions[:, :2]), np.abs(positions[0, 0]), atol=1e-6)
+    unit = np.allclose(np.linalg.norm(positions[:, :2], axis=1), 1.0, atol=0.02)
+    relative = bool(unit or (square and abs(positions[0, 0]) >= 0.5))
     gaps = [np.linalg.norm(a - b) for i, a in enumerate(positions) for b in positions[:i]]
     arms = [log.parameter("SIH_L_PITCH"), log.parameter("SIH_L_ROLL")]
-    if relative and simulated and None not in arms:
+    if relative and simulated and count == 4 and None not in arms:
         return (
             radius,
             Line("rotor_positions", _rows(np.sign(positions) * [*arms, 0.0]), "m, FLU",
                  "SIH_L_PITCH, SIH_L_ROLL in the order of CA_ROTOR*"),
-            Line("rotor_directions", str(directions.tolist()), "", "the signs of CA_ROTOR0..3_KM"),
+            Line("rotor_directions", str(directions.tolist()), "", "the signs of CA_ROTOR*_KM"),
         )  # fmt: skip
     if relative:
         where = Line(
@@ -201,8 +201,8 @@ def _rotors(log: Log, simulated: bool) -> tuple[Line, ...]:
     return (
         radius,
         Line("rotor_positions", _rows(positions), "m, FLU",
-             "CA_ROTOR0..3 _PX, _PY, _PZ (y and z turned from FRD); CHECK, PX4 flies as well with another scale"),
-        Line("rotor_directions", str(directions.tolist()), "", "the signs of CA_ROTOR0..3_KM"),
+             "CA_ROTOR*_PX, _PY, _PZ (y and z turned from FRD); CHECK, PX4 flies as well with another scale"),
+        Line("rotor_directions", str(directions.tolist()), "", "the signs of CA_ROTOR*_KM"),
     )  # fmt: skip
 
 

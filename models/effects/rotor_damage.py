@@ -23,6 +23,7 @@ def formula(motion: Motion, *, loss_1: Array, loss_2: Array, loss_3: Array, loss
         return motion.with_(thrust=motion.thrust * factor)
     xp = array_namespace(motion.rotor_thrust)
     each = [(1.0 - loss) * motion.rotor_thrust[:, i] for i, loss in enumerate(losses)]
+    each += [motion.rotor_thrust[:, i] for i in range(len(losses), motion.rotor_thrust.shape[1])]
     weaker = xp.stack(each, axis=-1)
     share = xp.sum(weaker, axis=1) / xp.clip(xp.sum(motion.rotor_thrust, axis=1), 1e-9, None)
     return motion.with_(thrust=motion.thrust * share, rotor_thrust=weaker)

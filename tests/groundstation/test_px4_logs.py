@@ -8,6 +8,8 @@ from ulog_writer import Written
 
 from trueflight.groundstation.reading import read_flight, segments
 from trueflight.groundstation.reading.px4_log import load_ulog
+from trueflight.groundstation.reading.writing import write_flight
+from trueflight.groundstation.versions.vehicle_draft import draft_of
 from trueflight.models.errors import InputError
 from trueflight.models.vehicle import Vehicle
 
@@ -360,12 +362,51 @@ def test_armed_on_the_ground_is_no_flight(tmp_path):
         read(log, tmp_path)
 
 
-def test_six_motors_give_a_collective_and_no_motors(tmp_path):
+def test_six_motors_of_which_none_was_logged_give_a_collective(tmp_path):
     log = set_status(log_of("1.16"), system_type=13)
     log.parameters["CA_ROTOR_COUNT"] = 6
     flight = read(log, tmp_path)
     assert flight.motor_command is None and thrust_agrees(flight, 0.25)
     assert any(note.startswith("6 motors") for note in flight.notes)
+
+
+@pytest.mark.parametrize("count", [6, 8])
+def test_six_and_eight_motors_are_read_with_their_places_and_written(count, tmp_path):
+    log, one = set_status(log_of("1.16", leave_out=("actuator_motors",)), system_type=13), flown()
+    log.parameters["CA_ROTOR_COUNT"] = count
+    angles = 2 * np.pi * (0.5 + np.arange(count)) / count
+    for i, angle in enumerate(angles):
+        place = {"PX": 0.3 * np.cos(angle), "PY": 0.3 * np.sin(angle), "PZ": 0.0, "KM": 0.05 * (-1) ** i}
+        log.parameters |= {f"CA_ROTOR{i}_{axis}": float(value) for axis, value in place.items()}
+    rows = one.rows(50)
+    share = 1.0 + 0.1 * np.sin(0.1 * np.arange(len(rows)))[:, None] * np.cos(angles)
+    control = np.full((len(rows), 12), np.nan)
+    control[:, :count] = one.thrust[rows][:, None] * share
+    log.add("actuator_motors", one.t[rows], control=("f", control))
+    rpm = np.sqrt(np.clip(control[:, :count], 0.01, 1.0)) * 900.0 * 30 / np.pi
+    log.add(
+        "esc_status", one.t[rows], **{f"esc[{i}].esc_rpm": ("i", rpm[:, i].astype(int)) for i in range(count)}
+    )
+    path = log.save(tmp_path / "log.ulg")
+    drafted = draft_of(path, tmp_path / "vehicle.toml", 2.0)
+    np.testing.assert_allclose(
+        drafted.vehicle.rotor_positions,
+        0.3 * np.stack([np.cos(angles), -np.sin(angles), 0 * angles], -1),
+        atol=1e-3,
+    )
+    assert drafted.vehicle.rotor_directions == (1, -1) * (count // 2)
+    flight = read_flight(path, drafted.vehicle)
+    assert flight.motor_command.shape[1] == flight.rotor_speed.shape[1] == count
+    middle, same = middle_of(flight, one)
+    np.testing.assert_allclose(flight.motor_command[middle].mean(axis=1), one.thrust[same], atol=0.02)
+    assert not any("rotor_positions: correct" in note for note in flight.notes)
+    write_flight(flight, tmp_path / "flight.csv")
+    again = read_flight(tmp_path / "flight.csv")
+    np.testing.assert_allclose(again.rotor_speed, flight.rotor_speed, atol=0.1)
+    assert (
+        again.motor_command.shape[1] == count
+        and again.vehicle.rotor_positions == drafted.vehicle.rotor_positions
+    )
 
 
 @pytest.mark.parametrize("share", [0.02, 0.15, 0.4, 0.6, 0.999])
