@@ -4,6 +4,7 @@ python docs/pictures/architecture.py      # writes house.svg, tick.svg and diagn
 """
 
 import ast
+from collections.abc import Iterable
 from pathlib import Path
 
 import matplotlib
@@ -14,17 +15,17 @@ from matplotlib.patches import FancyBboxPatch
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
-INK, FILL, ARROW = "#1a2b3c", "#e8eef5", "#7a8ca0"
+INK, FILL, ARROW, SHORT_CUT = "#1a2b3c", "#e8eef5", "#4a6a8a", "#c8d4e0"
 
-FLOORS = (  # groundstation/, from the top: who may import stands above what is imported
-    ("commands", "library"),
-    ("study",),
-    ("views", "report"),
-    ("output",),
-    ("versions", "learn"),
-    ("evaluate",),
-    ("identify",),
-    ("reading", "measured", "design", "operate", "results"),
+FLOORS = (  # groundstation/, from the top: who may import stands above what is imported; and how far to the right
+    (("commands", -2.4), ("library", 2.4)),
+    (("study", -0.6),),
+    (("views", -3.6), ("report", 1.6)),
+    (("output", -1.2),),
+    (("versions", -3.4), ("learn", 2.6)),
+    (("evaluate", -0.2),),
+    (("identify", -1.7),),
+    (("reading", -4.6), ("measured", -2.3), ("design", 0.0), ("results", 2.3), ("operate", 4.6)),
 )
 
 TICK = (
@@ -91,23 +92,34 @@ def save(figure: plt.Figure, name: str) -> None:
     (HERE / name).write_text("\n".join(line.rstrip() for line in text.splitlines()) + "\n")
 
 
+def over_others(arrows: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
+    """The arrows whose end is reached over other rooms as well."""
+    beside: dict[str, set[str]] = {}
+    for one, two in arrows:
+        beside.setdefault(one, set()).add(two)
+
+    def below(room: str) -> set[str]:
+        near = beside.get(room, set())
+        return near.union(*(below(other) for other in near))
+
+    return {(one, two) for one, near in beside.items() for two in near if any(two in below(r) for r in near)}
+
+
 def house() -> None:
     """groundstation/: rooms and arrows; an arrow points from who imports to what is imported."""
     figure, axes = plt.subplots(figsize=(10, 9))
-    place = {}
-    for floor, names in enumerate(FLOORS):
-        for i, name in enumerate(names):
-            place[name] = ((i - (len(names) - 1) / 2) * 2.3, -1.45 * floor)
+    place = {name: (x, -1.45 * floor) for floor, names in enumerate(FLOORS) for name, x in names}
     arrows = rooms()
+    pale = over_others(arrows)
     assert {room for pair in arrows for room in pair} == set(place), "a room is not drawn: add it to FLOORS"
     for (one, two), count in sorted(arrows.items()):
         (x, y), (u, v) = place[one], place[two]
         assert y > v, f"{one} imports {two}, which does not stand below it: move it in FLOORS"
-        bend = 0.12 if x == u and y - v > 1.5 else 0.0
+        short_cut = (one, two) in pale
         axes.annotate(
-            "", (u, v + 0.33), (x, y - 0.33),
-            arrowprops={"arrowstyle": "-|>", "color": ARROW, "lw": 0.6 + 0.12 * min(count, 12),
-                        "connectionstyle": f"arc3,rad={bend}"},
+            "", (u, v + 0.33), (x, y - 0.33), zorder=0 if short_cut else 1,
+            arrowprops={"arrowstyle": "-|>", "color": SHORT_CUT if short_cut else ARROW,
+                        "lw": 0.6 + 0.12 * min(count, 12)},
         )  # fmt: skip
     for name, (x, y) in place.items():
         box(axes, x, y, 1.7, name)

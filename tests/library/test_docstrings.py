@@ -148,3 +148,9 @@ def test_every_effect_has_a_source_and_units() -> None:
 def test_the_page_of_the_library_tells_every_function() -> None:
     page = (Path(__file__).parents[2] / "docs" / "library.md").read_text(encoding="utf-8")
     assert not [one.__name__ for one in FUNCTIONS if f"tf.{one.__name__}" not in page]
+
+
+def test_the_reference_of_the_site_names_everything_that_the_library_offers() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "library.md").read_text()
+    told = re.findall(r"^\.\. auto\w+:: (\w+)$", page, flags=re.MULTILINE)
+    assert sorted(told) == sorted(library.__all__)
