@@ -49,8 +49,9 @@ then on the wrong axis."""
 TOLD_ANGLE = np.radians(4.0)
 """Turn from which on it is told; compasses and motion capture are aligned within a few degrees."""
 UNTOLD = "the accelerometer feels too little along x and y to tell where they point: drag and wind rest on its mounting"
-LATEST, TOLD_LATE = 0.3, 0.015
-"""s of delay that are looked for, and from which on one is told and undone."""
+LATEST, TOLD_LATE, UNTOLD_LATE = 0.3, 0.015, 0.05
+"""s of delay that are looked for, from which on one is told and undone, and from which on it is told that the flight
+leaves open whether there is one."""
 STEPS = (0.005, 0.02)
 """s by which delays are tried in the end, and at first: windows of half a second know no narrower valley."""
 MOST_JUMPS, MOST_CUT = 5, 0.05
@@ -92,6 +93,7 @@ def reconcile(t: np.ndarray, columns: Columns, flying: np.ndarray) -> Reconciled
     columns = {name: column[keep] for name, column in columns.items()}
     checks = _examined(Windows(t[keep], flying[keep], rates), columns, late)
     notes += [c.text for c in checks if c.verdict in ("undone", "weak")]
+    notes += [c.text for c in late if c.verdict == "agrees"]
     return Reconciled(keep, columns, checks, rates, tuple(notes))
 
 
@@ -111,8 +113,13 @@ def _examined(windows: Windows, columns: Columns, late: list[Check]) -> tuple[Ch
     fault = _likeliest(windows, columns, moving)
     if fault is not None or any(p.left > DISAGREE for p in moving):
         return (*_disagreements(windows, columns, moving, fault), *still)
-    found = {c.pair: c for c in (*late, *_small_turns(columns, moving))}
-    agreeing = [_agreement(windows, columns, p) for p in moving if p.name not in found]
+    untold = {c.pair: c.text for c in late if c.verdict == "agrees"}
+    undone = [c for c in late if c.verdict == "undone"]
+    found = {c.pair: c for c in (*undone, *_small_turns(columns, moving))}
+    agreeing = [
+        replace(c, text="; ".join(filter(None, (c.text, untold.get(c.pair, "")))))
+        for c in (_agreement(windows, columns, p) for p in moving if p.name not in found)
+    ]
     return (*found.values(), *agreeing, *still)
 
 
@@ -268,8 +275,14 @@ def _undelayed(windows: Windows, columns: Columns) -> tuple[Columns, list[Check]
     names = {p.name for p in windows.pairs(columns) if p.moves}
     trajectory = _trajectory(columns)
     for name, shifted in ((ROTATION, ("quaternion",)), (FORCE, trajectory), (TILT, trajectory)):
-        late, left = _delay(windows, out, name) if name in names else (0.0, 0.0)
+        late, left, unsure = _delay(windows, out, name) if name in names else (0.0, 0.0, 0.0)
         if abs(late) < TOLD_LATE:
+            if unsure >= UNTOLD_LATE:
+                what = "attitude" if name == ROTATION else " and ".join(shifted)
+                text = (
+                    f"the {what} may be up to {1e3 * unsure:.0f} ms late: the flight moves too little to tell"
+                )
+                checks.append(Check(name, "agrees", left, text))
             continue
         for n in shifted:
             out[n] = windows.earlier(out[n], late, n == "quaternion")
@@ -282,27 +295,31 @@ def _undelayed(windows: Windows, columns: Columns) -> tuple[Columns, list[Check]
     return out, checks
 
 
-def _delay(windows: Windows, columns: Columns, name: str) -> tuple[float, float]:
-    """How late (s) attitude or trajectory is against the IMU, and the share left then; 0 where it is not sure."""
+def _delay(windows: Windows, columns: Columns, name: str) -> tuple[float, float, float]:
+    """How late (s) attitude or trajectory is against the IMU, or the trajectory against the attitude; 0 where it is not
+    sure. With it the share left then, and how late it could be (s) as far as the flight tells."""
     step, coarse = (max(1, round(seconds / windows.dt)) for seconds in STEPS)
     reach = int(LATEST / windows.dt) // step * step
     here = windows.pair(name, columns, 0, reach)
 
     def left_at(shifts: np.ndarray) -> np.ndarray:
-        return np.array([windows.later(here, columns, int(shift), reach).left for shift in shifts])
+        return np.array([windows.later(here, columns, int(shift), reach).left_but_drag for shift in shifts])
 
     rough = np.arange(-reach, reach + 1, coarse)
-    near = int(rough[np.argmin(left_at(rough))])
+    about = left_at(rough)
+    near = int(rough[np.argmin(about)])
     shifts = np.arange(max(near - coarse, -reach), min(near + coarse, reach) + 1, step)
-    left = left_at(shifts)
+    left, now = left_at(shifts), here.left_but_drag
     best = int(np.argmin(left))
+    possible = [abs(k) for k, some in zip(rough, about, strict=True) if here.gained(some, left[best]) < SURE]
+    unsure = float(max(possible, default=0) * windows.dt)
     if not here.moves or best in (0, len(left) - 1):
-        return 0.0, here.left
-    if here.likelihood(left[best]) < SURE or left[best] > 0.5 * here.left:
-        return 0.0, here.left
+        return 0.0, now, unsure
+    if here.gained(now, left[best]) < SURE or left[best] > 0.5 * now:
+        return 0.0, now, unsure
     curve = left[best - 1] - 2 * left[best] + left[best + 1]
     vertex = 0.5 * (left[best - 1] - left[best + 1]) / curve if curve > 0 else 0.0
-    return float((shifts[best] + vertex * step) * windows.dt), float(left[best])
+    return float((shifts[best] + vertex * step) * windows.dt), float(left[best]), unsure
 
 
 def _small_turns(columns: Columns, moving: list[Pair]) -> Iterator[Check]:

@@ -35,8 +35,7 @@ class Pair:
     """Two sides of one motion, (M, k) each, in the same unit.
 
     They last `seconds`, in windows of `window` s. Below an RMS of `weak` they tell nothing (where one side alone moves:
-    below three times that). `beside` (M, k) is the velocity where `one` may lack a share of it: drag is no
-    disagreement.
+    below three times that). `beside` (M, k) is the velocity, where `one` may lack a share of it.
     """
 
     name: str
@@ -58,17 +57,29 @@ class Pair:
     @property
     def left(self) -> float:
         """Share of the motion's energy by which the two differ; 0 where they agree, 2 where they are strangers."""
-        energy = 0.5 * (np.sum(self.one**2) + np.sum(self.other**2))
+        return self._share(self.one - self.other)
+
+    @property
+    def left_but_drag(self) -> float:
+        """The same, without what drag may take: it turns the phase as a delay does."""
         differ = self.one - self.other
         if self.beside is not None:
             drag = -np.sum(differ * self.beside, axis=0) / np.maximum(np.sum(self.beside**2, axis=0), 1e-12)
             differ = differ + np.clip(drag, 0.0, MOST_DRAG) * self.beside
+        return self._share(differ)
+
+    def _share(self, differ: np.ndarray) -> float:
+        energy = 0.5 * (np.sum(self.one**2) + np.sum(self.other**2))
         return float(np.sum(differ**2) / max(energy, 1e-12))
 
     def likelihood(self, left: float) -> float:
         """Log likelihood that is gained where only the share `left` stays, every window counted once."""
+        return self.gained(self.left, left)
+
+    def gained(self, before: float, after: float) -> float:
+        """Log likelihood that is gained where the share `after` stays instead of `before`."""
         count = self.one.shape[1] * self.seconds / self.window
-        return float(0.5 * count * np.log(max(self.left, 1e-6) / max(left, 1e-6)))
+        return float(0.5 * count * np.log(max(before, 1e-6) / max(after, 1e-6)))
 
 
 class Windows:
