@@ -12,7 +12,14 @@ from trueflight.groundstation.reading import plausible, rows
 from trueflight.groundstation.reading.actuation import actuation_checks
 from trueflight.groundstation.reading.airborne import flying_mask
 from trueflight.groundstation.reading.consistency import reconcile, refusal
-from trueflight.groundstation.reading.mapping import Mapping, corrected, corrected_time
+from trueflight.groundstation.reading.mapping import (
+    Mapping,
+    corrected,
+    corrected_time,
+    left_out,
+    span_of,
+    units_of,
+)
 from trueflight.groundstation.reading.uniform import MOST_LOST, even_clock, slopes
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -33,6 +40,7 @@ def assemble(
     most_lost: float = MOST_LOST,
     mapping: Mapping | None = None,
     accelerometer: bool = True,
+    named_by: Mapping | None = None,
 ) -> Flight:
     """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
     find what was flown.
@@ -40,10 +48,11 @@ def assemble(
     `place(row)` names a row in messages; `extra` are columns that are kept and not analysed; `flying` (N,) is True
     where the log says that the vehicle is in the air (without it, that is found out), `commanded` (N,) where these
     commands flew it; `notes` are told to the user; `most_lost` is the share of samples that gaps may take; `mapping`
-    corrects the columns; `accelerometer` is False where the specific force is an estimator's. Raises `InputError` for
-    anything that cannot be analysed.
+    corrects the columns; `accelerometer` is False where the specific force is an estimator's; `named_by`
+    is the mapping that they were read by already. Raises `InputError` for anything that cannot be analysed.
     """
     origin = str(path)
+    columns = {name: column for name, column in columns.items() if name not in left_out(mapping)}
     _check_groups(origin, columns)
     columns, dead = rows.without_dead_battery(columns)
     names = list(columns)
@@ -58,10 +67,13 @@ def assemble(
     if mapping is not None:
         t = corrected_time(mapping, t, vehicle)
     t, every, mended = _whole_rows(t, every, names, place)
+    t, every, cut = _cut(t, every, span_of(named_by or mapping), origin)
+    mended += cut
     if mapping is not None:
         every |= corrected(mapping, t, {name: every[name] for name in names if name in every}, vehicle)
         mended.append(f"corrected by {mapping.source}")
-    plausible.check_units({name: every[name] for name in names}, vehicle, origin)
+    units = units_of(named_by or mapping)
+    plausible.check_units(t, {name: every[name] for name in names}, vehicle, origin, units)
     every, wrong_voltage = plausible.without_wrong_voltage(every, vehicle)
     t, every, resampled = even_clock(t, rows.continuous(every), origin, most_lost)
     said = [*notes, *dead, *mended, *wrong_voltage, *resampled]
@@ -116,6 +128,22 @@ def _whole_rows(
     kept = whole.pop("row")
     others = {name: column[kept] for name, column in every.items() if name not in wanted}
     return t[kept], {**whole, **others}, [*sorted_, *repeated, *missing]
+
+
+def _cut(
+    t: np.ndarray, every: dict[str, np.ndarray], span: tuple[float, float], origin: str
+) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
+    """What is within the `span` of time; what was cut off."""
+    keep = (t >= span[0]) & (t <= span[1])
+    if np.all(keep):
+        return t, every, []
+    if np.sum(keep) < plausible.LEAST:
+        raise InputError(
+            f"{origin}: nothing is left from {max(span[0], t[0]):g} until {span[1]:g} s by [time] of the mapping; the "
+            f"log has t = {t[0]:.1f} to {t[-1]:.1f} s"
+        )
+    said = f"cut to t = {t[keep][0]:.1f} to {t[keep][-1]:.1f} s of {t[0]:.1f} to {t[-1]:.1f} s by the mapping"
+    return t[keep], {name: column[keep] for name, column in every.items()}, [said]
 
 
 def _left_out(t: np.ndarray, in_air: np.ndarray, said: list[str], origin: str) -> list[str]:

@@ -61,14 +61,26 @@ def read_csv_text(path: Path) -> CsvText:
     if body and not body[-1].endswith(("\n", "\r")) and body[-1].count(delimiter) < first.count(delimiter):
         body.pop()
         notes.append("the last line is cut short and was left out")
-    # the first rows may hold whole numbers only
-    decimal = "," if delimiter != "," and _any(body, ",") and not _any(body, ".") else "."
+    decimal = _decimal(body, delimiter)
     content = "".join([first, "\n", *body]).encode()
     return CsvText(content, delimiter, decimal, below, tuple(notes))
 
 
-def _any(lines: list[str], mark: str) -> bool:
-    return any(mark in line for line in lines)
+def _decimal(lines: list[str], delimiter: str) -> str:
+    """The decimal mark of the first number that has one: the first rows may hold whole numbers only, and texts or dates
+    in other columns any mark. Between commas only a quoted number can have a comma."""
+    quoted = '"' if delimiter == "," else '"?'
+    mark = re.escape(delimiter)
+    number = re.compile(
+        rf"(?:^|{mark})[ ]*(?:{quoted}[+-]?\d*(,)\d+(?:[eE][+-]?\d+)?{quoted}|\"?[+-]?\d*(\.)\d+(?:[eE][+-]?\d+)?\"?)"
+        rf"[ ]*(?={mark}|$)"
+    )
+    for line in lines:
+        if "." in line or "," in line:
+            found = number.search(line.rstrip("\r\n"))
+            if found:
+                return found[1] or found[2]
+    return "."
 
 
 def _decoded(raw: bytes) -> tuple[str, list[str]]:

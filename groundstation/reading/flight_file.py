@@ -5,7 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from trueflight.groundstation.reading.assemble import assemble
-from trueflight.groundstation.reading.mapping import Given, apply_mapping, load_mapping, merged, read_mappings
+from trueflight.groundstation.reading.mapping import (
+    Given,
+    apply_mapping,
+    load_mapping,
+    merged,
+    read_mappings,
+)
 from trueflight.groundstation.reading.sources import Sources, refuse_topics
 from trueflight.groundstation.reading.table import Table, own_columns, read_table, unknown_columns
 from trueflight.models.errors import InputError
@@ -80,7 +86,7 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Give
         return assemble(
             path, believed, mapped.t, mapped.columns, table.place,
             extra=mapped.extra, flying=None, notes=(*table.notes, *mapped.notes),
-            accelerometer=not mapped.estimated_force,
+            accelerometer=not mapped.estimated_force, named_by=whole,
         )  # fmt: skip
     columns = own_columns(table)
     extra = unknown_columns(table)

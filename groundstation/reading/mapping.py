@@ -27,7 +27,9 @@ mended by
   turned back;
 * `axes = ["y", "-x", "z"]` (vectors): our x, y, z are these axes of the log's; `axes = "body"` for a velocity along the
   body's axes;
-* `late = 0.1`: the values come so many seconds after what they tell, and are shifted back.
+* `late = 0.1`: the values come so many seconds after what they tell, and are shifted back;
+* `leave_out = true`: as if the quantity had not been logged;
+* `from = 12.5` and `until = 60` of `[time]`: what is before and after, in s, is cut off.
 
 A mapping without the column of `[time]` names none: it corrects what is read already, from a table in the project's
 own names or from a log. Which topics of a log are read, `reading.sources` tells. One key of it is a line that a command
@@ -92,7 +94,7 @@ UNITS: dict[str, dict[str, tuple[float, float]]] = {
 
 WORLD = ("position", "velocity", "position_reference", "velocity_reference", "acceleration_reference")
 BODY = ("angular_velocity", "specific_force", "body_rate_command")
-_KEYS = {"column", "columns", "unit", "sign", "frame", "late"}
+_KEYS = {"column", "columns", "unit", "sign", "frame", "late", "leave_out"}
 _SPECIAL = {"time": "s", "attitude": "rad", "world_acceleration": "m/s^2"}
 
 
@@ -182,8 +184,15 @@ def load_mapping(given: str | Path) -> Mapping:
         if not isinstance(entry, dict):
             raise InputError(f"{source}: '{name}' must be a table, [{name}] with column = \"...\"")
         allowed = (
-            {"roll", "pitch", "yaw", "unit", "sign", "frame", "late"} if name == "attitude" else set(_KEYS)
+            {"roll", "pitch", "yaw", "unit", "sign", "frame", "late", "leave_out"}
+            if name == "attitude"
+            else set(_KEYS)
         )
+        if name == "time":
+            allowed = {*_KEYS, "from", "until"} - {"leave_out"}
+        if not isinstance(entry.get("leave_out", False), bool):
+            given_value = shown(entry["leave_out"])
+            raise InputError(f"{source}: [{name}] leave_out must be true or false, not {given_value}")
         if name == "quaternion":
             allowed |= {"order", "inverse", "body"}
         if name in (*WORLD, *BODY):
@@ -205,8 +214,8 @@ def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTab
     columns: dict[str, np.ndarray] = {}
     notes: list[str] = []
     t = _quantity(table, mapping, "time", vehicle, used, 1, "s")
-    for name in mapping.quantities:
-        if name not in COLUMNS:
+    for name, entry in mapping.quantities.items():
+        if name not in COLUMNS or entry.get("leave_out"):
             continue
         names, unit, _ = COLUMNS[name]
         values = _quantity(table, mapping, name, vehicle, used, len(names), unit)
@@ -215,7 +224,7 @@ def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTab
     if "world_acceleration" in mapping.quantities:
         values = _quantity(table, mapping, "world_acceleration", vehicle, used, 3, "m/s^2")
         world = enu_from_ned(values) if _frame(mapping, "world_acceleration") == "ned_frd" else values
-    if "attitude" in mapping.quantities:
+    if "attitude" in mapping.quantities and not mapping.quantities["attitude"].get("leave_out"):
         columns["quaternion"], said = _attitude(table, mapping, world, used)
         notes += said
     if world is not None:
@@ -233,6 +242,32 @@ def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTab
     return MappedTable(t - t[0], columns, extra, tuple(notes), world is not None)
 
 
+def left_out(mapping: Mapping | None) -> set[str]:
+    """The quantities, by attribute of `Flight`, that a mapping reads as if they had not been logged."""
+    quantities = {} if mapping is None else mapping.quantities
+    names = {name for name, entry in quantities.items() if entry.get("leave_out")}
+    return names | ({"quaternion"} if "attitude" in names else set())
+
+
+def units_of(mapping: Mapping | None) -> dict[str, str]:
+    """The units that a mapping names, by attribute of `Flight`."""
+    quantities = {} if mapping is None else mapping.quantities
+    return {name: str(entry["unit"]) for name, entry in quantities.items() if "unit" in entry}
+
+
+def span_of(mapping: Mapping | None) -> tuple[float, float]:
+    """From when until when, s, a mapping reads a flight."""
+    entry = {} if mapping is None else mapping.quantities.get("time", {})
+    source = "" if mapping is None else mapping.source
+    low, high = (
+        _number(source, "time", key, entry[key], "s") if key in entry else end
+        for key, end in (("from", -np.inf), ("until", np.inf))
+    )
+    if low >= high:
+        raise InputError(f"{source}: [time] from = {low:g} is not before until = {high:g}")
+    return low, high
+
+
 def corrected_time(mapping: Mapping, t: np.ndarray, vehicle: Vehicle) -> np.ndarray:
     """The clock (N,) in s, in the unit that a mapping tells."""
     return _in_unit(mapping, "time", t, vehicle, 1, "s") if "time" in mapping.quantities else t
@@ -245,7 +280,7 @@ def corrected(
     mapping tells. Raises `InputError` for a quantity that is not there, or a key that names columns."""
     out = dict(columns)
     for name, entry in mapping.quantities.items():
-        if name == "time":
+        if name == "time" or entry.get("leave_out"):
             continue
         column = "quaternion" if name == "attitude" else name
         if column not in columns:
@@ -271,7 +306,7 @@ def _mended(mapping: Mapping, t: np.ndarray, columns: dict[str, np.ndarray]) -> 
     attitude of its own time."""
     out = dict(columns)
     for name, entry in mapping.quantities.items():
-        if "late" in entry and name in (*out, "attitude"):
+        if "late" in entry and (name in out or (name == "attitude" and "quaternion" in out)):
             column = "quaternion" if name == "attitude" else name
             out[column] = _shifted(t, out[column], _number(mapping.source, name, "late", entry["late"], "s"))
     for name, entry in mapping.quantities.items():

@@ -16,10 +16,14 @@ from trueflight.models.vehicle import GRAVITY, Vehicle
 
 LOWEST_RATE = 10.0  # Hz; below it neither rates nor drag can be told from noise
 SHORTEST = 2.0  # s
+LEAST = 20  # samples
+FULL = 1.5  # of full throttle, with some room: what reaches further is in another unit, or ran away
 
 HIGHEST_RATE = 60.0  # rad/s; a racing quadrotor reaches 35
 HIGHEST_FORCE = 16.0 * GRAVITY  # m/s²; the range of most accelerometers on flight controllers
+AT_ITS_END = 0.995  # of the range, for a sensor that tells no more than its greatest number
 MOST_BEYOND = 0.01  # share of the flight; an impact takes some samples
+STAYS = 0.8  # share of the rest of a flight that what ran away is beyond
 CELL = 3.7  # V nominal, lithium polymer
 PACK = (0.6, 1.4)
 """Voltage over nominal: 2.8 V a cell where nominal was said of full cells, to 4.35 V where of empty ones."""
@@ -31,7 +35,7 @@ AIR_DENSITY = 1.2  # kg/m³
 
 def check_clock(t: np.ndarray, place: Callable[[int], str]) -> None:
     """The clock (N,): finite, never backwards, and in seconds. `place(row)` names a row in a message."""
-    if len(t) < 20:
+    if len(t) < LEAST:
         raise InputError(f"{place(0)}: only {len(t)} samples; at least {SHORTEST:g} s of flight are needed")
     bad = np.flatnonzero(~np.isfinite(t))
     if bad.size:
@@ -63,8 +67,10 @@ def check_clock(t: np.ndarray, place: Callable[[int], str]) -> None:
         )
 
 
-def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -> None:
-    """Magnitudes that tell a wrong unit: degrees, g, millivolts, raw 16-bit commands."""
+def check_units(
+    t: np.ndarray, columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str, units: dict[str, str]
+) -> None:
+    """Magnitudes that tell a wrong unit: degrees, g, millivolts, raw 16-bit commands; `units` were named."""
     if (q := columns.get("quaternion")) is not None:
         norm = np.linalg.norm(q, axis=1)
         wrong = np.abs(norm - 1) > 0.02
@@ -80,13 +86,18 @@ def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -
             )
     for name in ("angular_velocity", "body_rate_command"):
         if (w := columns.get(name)) is not None and (peak := _high(w)) > HIGHEST_RATE:
+            beyond = np.max(np.abs(w), axis=1) > HIGHEST_RATE
+            first = int(np.argmax(beyond))
+            if first > LEAST and np.mean(beyond[first:]) > STAYS:  # degrees come back
+                raise InputError(_ran_away(t, w, beyond, name, f"beyond {HIGHEST_RATE:.0f} rad/s", origin))
             raise InputError(
                 f"{origin}: {COLUMNS[name][2]} reaches {peak:.0f} rad/s; is it in deg/s? Convert it to "
                 "rad/s, "
                 f"or read it with --mapping '{name}.unit = \"deg/s\"'"
             )
     if (u := columns.get("thrust_command")) is not None:
-        _check_thrust(u, origin)
+        _check_runaway(t, u, "thrust_command", origin, units)
+        _check_thrust(u, vehicle.hover_thrust, origin)
     if (volts := columns.get("battery_voltage")) is not None:
         level = float(np.nanmedian(volts))
         if MILLIVOLTS[0] < level / vehicle.nominal_voltage < MILLIVOLTS[1] and abs(level - 65535.0) > 1.0:
@@ -96,7 +107,8 @@ def check_units(columns: dict[str, np.ndarray], vehicle: Vehicle, origin: str) -
                 "is it in mV? Read it with --mapping 'battery_voltage.unit = \"mV\"'"
             )
     if (motors := columns.get("motor_command")) is not None:
-        _check_motors(motors, origin)
+        _check_runaway(t, motors, "motor_command", origin, units)
+        _check_motors(motors, vehicle.hover_thrust, origin)
     if (speed := columns.get("rotor_speed")) is not None:
         _check_rotor_speed(speed, vehicle, origin)
     if (
@@ -140,20 +152,15 @@ def without_wrong_voltage(
 
 def check_sensors(t: np.ndarray, columns: dict[str, np.ndarray], flying: np.ndarray, origin: str) -> None:
     """Readings beyond what sensors of a flight controller can tell: a column that runs away, or another quantity."""
-    for name, limit, unit in (
-        ("specific_force", HIGHEST_FORCE, "m/s^2"),
-        ("angular_velocity", HIGHEST_RATE, "rad/s"),
+    for name, limit, unit, more in (
+        ("specific_force", HIGHEST_FORCE, "m/s^2", " (16 g)"),
+        ("angular_velocity", HIGHEST_RATE, "rad/s", ""),
     ):
         if (column := columns.get(name)) is None:
             continue
-        beyond = flying & (np.max(np.abs(column), axis=1) > limit)
+        beyond = flying & (np.max(np.abs(column), axis=1) > AT_ITS_END * limit)
         if np.sum(beyond) > MOST_BEYOND * np.sum(flying):
-            row = int(np.argmax(beyond))
-            raise InputError(
-                f"{origin}: {COLUMNS[name][2]} is beyond {limit:.0f} {unit} from t = {t[row]:.1f} s on, in "
-                f"{100 * np.sum(beyond) / np.sum(flying):.0f} % of the flight: the sensor or its export ran away; "
-                "cut the flight, or leave the column out"
-            )
+            raise InputError(_ran_away(t, column, beyond, name, f"beyond {limit:.0f} {unit}{more}", origin))
 
 
 def implausible_force(columns: dict[str, np.ndarray], flying: np.ndarray) -> str:
@@ -205,20 +212,62 @@ def body_rate(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
     return np.asarray(vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 2.0) / seconds)
 
 
-def _check_motors(motors: np.ndarray, origin: str) -> None:
-    high, low = float(np.nanquantile(motors, 0.999)), float(np.nanquantile(motors, 0.001))
-    if high <= 1.5 and low >= -1.05:
+def _ran_away(
+    t: np.ndarray, column: np.ndarray, beyond: np.ndarray, name: str, what: str, origin: str
+) -> str:
+    """What to say of a `column` (N,) or (N, k), of the quantity `name`, that is `what` in the samples `beyond` (N,):
+    which column, since when, how long, how far, and the line of a mapping that reads the rest."""
+    flat = np.abs(column.reshape(len(t), -1))
+    worst, first = int(np.argmax(flat.max(axis=0))), int(np.argmax(beyond))
+    cut = f"'time.until = {np.floor(10 * t[first]) / 10:g}'" if t[first] - t[0] > SHORTEST else ""
+    leave = f"'{name}.leave_out = true'"
+    return (
+        f"{origin}: {COLUMNS[name][0][worst]} is {what} from t = {t[first]:.1f} s on, in {100 * np.mean(beyond):.0f} % "
+        f"of the flight, up to {flat.max():.4g}: the sensor, logger or export ran away or is at its end; export it "
+        f"again, or read what is good with --mapping {f'{cut} (or earlier), or {leave}' if cut else leave}"
+    )
+
+
+def _check_runaway(t: np.ndarray, column: np.ndarray, name: str, origin: str, units: dict[str, str]) -> None:
+    """Commands that were 0 to 1 of full throttle first and are not any more, or are not in the unit that was named."""
+    highest = np.max(np.abs(column.reshape(len(t), -1)), axis=1)
+    beyond = highest > FULL
+    if np.mean(beyond) < 0.001:
         return
-    if low >= 900 and high <= 2500:
-        guess = "microseconds of PWM? Read them with --mapping 'motor_command.unit = \"pwm\"'"
-    elif low >= 0 and high <= 2100 and high > 105:
-        guess = "DShot (48 to 2047)? Read them with --mapping 'motor_command.unit = \"dshot\"'"
-    elif low >= 0 and high <= 105:
-        guess = "in percent? Read them with --mapping 'motor_command.unit = \"percent\"'"
-    elif high <= 66000 and low >= 0:
-        guess = "a 16-bit command? Read them with --mapping 'motor_command.unit = \"u16\"'"
-    else:
-        guess = "give them as 0 to 1 of full throttle"
+    before = highest[: int(np.argmax(beyond))]
+    throttle = len(before) > LEAST and 0.1 < np.median(before) < 1.0 and np.ptp(before) > 0.01
+    if not throttle and name not in units:  # in another unit throughout
+        return
+    named = f' in unit "{units[name]}"' if name in units else ""
+    raise InputError(_ran_away(t, column, beyond, name, f"beyond full throttle, 1,{named}", origin))
+
+
+def _command_unit(command: np.ndarray, high: float, hover: float) -> str:
+    """The unit of commands that reach `high`; '' for none that is known. Of pulse widths and DShot, whose ranges
+    overlap, the one in which the median is nearer to the `hover` thrust of the vehicle file."""
+    if high <= 105:
+        return "percent"
+    middle = float(np.median(command[command > 0]))
+    nearness = {}
+    if high <= 2500 and middle > 1000:
+        nearness["pwm"] = abs(np.log(1e-3 * (middle - 1000) / hover))
+    if high <= 2100 and middle > 48:
+        nearness["dshot"] = abs(np.log((middle - 48) / 1999 / hover))
+    return min(nearness, key=lambda unit: nearness[unit]) if nearness else "u16" if high <= 66000 else ""
+
+
+def _check_motors(motors: np.ndarray, hover: float, origin: str) -> None:
+    high, low = float(np.nanquantile(motors, 0.999)), float(np.nanquantile(motors, 0.001))
+    if high <= FULL and low >= -1.05:
+        return
+    unit = _command_unit(motors, high, hover) if low >= 0 else ""
+    guess = {
+        "pwm": "microseconds of PWM? ",
+        "dshot": "DShot (48 to 2047)? ",
+        "percent": "in percent? ",
+        "u16": "a 16-bit command? ",
+    }.get(unit, "give them as 0 to 1 of full throttle")
+    guess += f"Read them with --mapping 'motor_command.unit = \"{unit}\"'" if unit else ""
     raise InputError(
         f"{origin}: motor commands reach from {low:.4g} to {high:.4g}, but their unit is 0 to 1 of full throttle; "
         f"{guess}"
@@ -251,25 +300,22 @@ def _check_rotor_speed(speed: np.ndarray, vehicle: Vehicle, origin: str) -> None
     )
 
 
-def _check_thrust(u: np.ndarray, origin: str) -> None:
+def _check_thrust(u: np.ndarray, hover: float, origin: str) -> None:
     low, high = float(np.quantile(u, 0.001)), float(np.quantile(u, 0.999))
     if low < -0.05:
         raise InputError(
             f"{origin}: thrust_command goes down to {low:.3g}; up is positive (0 to 1). If the log is in "
             "FRD, read it with --mapping 'thrust_command.sign = -1'"
         )
-    if high <= 1.5:
+    if high <= FULL:
         return
-    if high > 2500:
-        guess = "a 16-bit command? Read it with --mapping 'thrust_command.unit = \"u16\"'"
-    elif high > 900:
-        guess = "a pulse width? Read it with --mapping 'thrust_command.unit = \"pwm\"'"
-    elif high <= 105:
-        guess = (
-            'in percent, or in newtons? Read it with --mapping \'thrust_command.unit = "percent"\', or "N"'
-        )
-    else:
-        guess = "divide it by full collective"
+    unit = _command_unit(u, high, hover)
+    guess = {
+        "pwm": "a pulse width? Read it with --mapping 'thrust_command.unit = \"pwm\"'",
+        "dshot": "DShot (48 to 2047)? Read it with --mapping 'thrust_command.unit = \"dshot\"'",
+        "percent": 'in percent, or in newtons? Read it with --mapping \'thrust_command.unit = "percent"\', or "N"',
+        "u16": "a 16-bit command? Read it with --mapping 'thrust_command.unit = \"u16\"'",
+    }.get(unit, "divide it by full collective")
     raise InputError(f"{origin}: thrust_command reaches {high:.4g}, it is 0 to 1 of full collective; {guess}")
 
 

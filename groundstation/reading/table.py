@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import io
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,7 +74,9 @@ class Table:
             return self.columns[name]
         close = difflib.get_close_matches(name, self.columns, 1)
         hint = (
-            f"did you mean '{close[0]}'?" if close else f"the file has: {', '.join(list(self.columns)[:30])}"
+            f"did you mean '{close[0]}'?"
+            if close
+            else f"the file has: {', '.join(name or '(no name)' for name in list(self.columns)[:30])}"
         )
         texts = (
             f"; {', '.join(self.text[:9])} hold text or lists, which are not read: one number a column"
@@ -172,9 +175,13 @@ def _read_csv(path: Path) -> Table:
     notes = list(text.notes)
     if ragged:
         if len(ragged) > MOST_RAGGED * len(arrow):
+            most = len(ragged) > 0.5 * (len(ragged) + len(arrow)) and text.delimiter == ","
+            hint = (
+                " (decimal commas between commas? export it with points, or with semicolons)" if most else ""
+            )
             raise InputError(
                 f"{path}, line {ragged[0]}: {len(ragged)} of {len(arrow) + len(ragged)} lines have another number of "
-                f"values than the header has names ({arrow.num_columns}); correct that line"
+                f"values than the header has names ({arrow.num_columns}){hint}; correct that line"
             )
         lines = "line" if len(ragged) == 1 else "lines"
         notes.append(f"{len(ragged)} {lines} without all values left out, the first is line {ragged[0]}")
@@ -261,6 +268,8 @@ def _reject_text(origin: str, name: str, values: list[str | None], first_line: i
     if bad and (known or len(bad) < len(values) / 2):
         row, value = bad[0]
         place = f"line {row + first_line}" if first_line else f"row {row + 1}"
+        mixed = first_line and re.fullmatch(r"[+-]?\d*[.,]\d+", str(value).strip())
+        hint = " here: decimal points and commas are mixed, write one of them throughout" if mixed else ""
         raise InputError(
-            f"{origin}, {place}: column '{name}' holds '{value}', which is not a number; correct it"
+            f"{origin}, {place}: column '{name}' holds '{value}', which is not a number{hint}; correct it"
         )

@@ -164,6 +164,18 @@ CONTENTS = {
     "words": (b"t,thrust_command\n0.01,0.4\n0.02,full\n0.03,0.4\n", ["line 3", "'full'", "not a number"]),
     "two columns of a name": (b"t,x,x\n0.01,1,2\n0.02,1,2\n", ["two columns are named 'x'", "rename"]),
     "ragged": (b"t,thrust_command\n0.01,0.4\n0.02,0.4,9\n0.03,0.4\n", ["correct that line"]),
+    "points, then commas": (
+        b"t;thrust_command\n0.01;0.4\n0,02;0,4\n0.03;0.4\n",
+        ["line 3", "'0,02'", "decimal points and commas are mixed"],
+    ),
+    "commas between commas": (
+        b"t,thrust_command\n" + b"".join(b"0,%d,0,4\n" % k for k in range(10, 40)),
+        ["decimal commas between commas?", "semicolons"],
+    ),
+    "lists": (
+        b't,thrust_command,p\n0.01,"[0.4]","[0,1]"\n0.02,"[0.4]","[0,1]"\n',
+        ["thrust_command", "'[0.4]'", "not a number"],
+    ),
     "binary": (bytes(range(256)) * 40, ["bad.csv"]),
 }
 

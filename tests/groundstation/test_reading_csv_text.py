@@ -7,6 +7,7 @@ import pytest
 from simulated import simulated
 
 from trueflight.groundstation.reading import read_flight, segments
+from trueflight.groundstation.reading.csv_text import read_csv_text
 from trueflight.groundstation.reading.writing import own_table
 from trueflight.models.errors import InputError
 from trueflight.models.vehicle import Vehicle
@@ -66,6 +67,13 @@ WRITTEN = {
     "quotes": lambda s: "\n".join(",".join(f'"{c}"' for c in row.split(",")) for row in s.splitlines()) + "\n",
     "a comma too many": lambda s: s.replace("\n", ",\n"),
     "dates": dated,
+    "decimal commas in quotes": lambda s: "\n".join(
+        ",".join('"' + c.replace(".", ",") + '"' for c in row.split(",")) for row in s.splitlines()
+    ) + "\n",
+    "decimal commas beside dates with points": lambda s: "\n".join(
+        row.replace(",", ";").replace(".", ",") + (";27.11.2026" if k else ";day")
+        for k, row in enumerate(s.splitlines())
+    ) + "\n",
 }  # fmt: skip
 
 
@@ -75,6 +83,14 @@ def test_a_table_is_read_however_it_is_written(way, columns, tmp_path):
     other = read(WRITTEN[way](text(columns)), tmp_path)
     for name in ("t", "position", "quaternion", "thrust_command", "battery_voltage"):
         np.testing.assert_allclose(getattr(other, name), getattr(plain, name), atol=2e-6)
+
+
+def test_decimal_commas_may_begin_late(tmp_path):
+    path = tmp_path / "late.csv"
+    path.write_text("t;x\n" + "".join(f"{k};0\n" for k in range(40)) + "41,5;0,25\n")
+    assert read_csv_text(path).decimal == ","
+    path.write_text("t;x\n" + "".join(f"{k};0\n" for k in range(40)) + "41.5;0.25\n")
+    assert read_csv_text(path).decimal == "."
 
 
 def test_latin_letters_in_a_name_are_no_obstacle(columns, tmp_path):
