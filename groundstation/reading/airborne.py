@@ -60,7 +60,9 @@ def _takeoff(t: np.ndarray, columns: dict[str, np.ndarray], a: int, b: int) -> i
     """First sample of run [a, b) that has left the ground."""
     if (position := columns.get("position")) is not None:
         up = position[a:b, 2] - position[a, 2] > RISE
-        return a + int(np.argmax(up)) if np.any(up) else b
+        # one that only comes down was taken over in the air
+        came_down = bool(position[a, 2] - position[b - 1, 2] > RISE)
+        return a + int(np.argmax(up)) if np.any(up) else a if came_down else b
     command = columns["thrust_command"][a:b]
     usual = command >= 0.8 * np.median(command)
     return int(np.searchsorted(t, t[a + int(np.argmax(usual))] + SETTLE))
@@ -70,7 +72,9 @@ def _landing(t: np.ndarray, columns: dict[str, np.ndarray], a: int, b: int) -> i
     """One past the last sample of run [a, b) that is above the ground."""
     if (position := columns.get("position")) is not None:
         up = position[a:b, 2] - position[b - 1, 2] > RISE
-        return b - int(np.argmax(up[::-1])) if np.any(up) else a
+        # one that ends at its height was handed over in the air
+        went_up = bool(position[b - 1, 2] - position[a, 2] > RISE)
+        return b - int(np.argmax(up[::-1])) if np.any(up) else b if went_up else a
     command = columns["thrust_command"][a:b]
     usual = command >= 0.8 * np.median(command)
     return int(np.searchsorted(t, t[b - 1 - int(np.argmax(usual[::-1]))] - SETTLE))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from trueflight.groundstation.reading.assemble import assemble
+from trueflight.groundstation.reading.clocks import of_one_clock
 from trueflight.groundstation.reading.mapping import Mapping
 from trueflight.groundstation.reading.rows import held
 from trueflight.models.errors import InputError
@@ -19,6 +20,8 @@ COMMANDED = ("takeoff", "mission", "landing")
 
 REFERENCES = ("position_reference", "velocity_reference", "acceleration_reference", "yaw_reference")
 
+MOST_OWN = 0.6
+"""Share of the ticks that must count the vehicle's clock."""
 KEPT = (
     "feedback_thrust",
     "feedback_body_rate",
@@ -43,7 +46,7 @@ def read_flight_record(
     """
     record = read_record(path)
     believed = _vehicle(path, record, vehicle)
-    ticks = record.ticks
+    ticks, foreign = _of_the_vehicle(path, record.ticks)
     columns = {name: ticks[name] for name in COLUMNS if name in ticks and not _unknown(ticks[name])}
     if "battery_voltage" in columns and not np.any(columns["battery_voltage"] > 0):
         del columns["battery_voltage"]
@@ -78,9 +81,28 @@ def read_flight_record(
         lambda row: f"{path}, tick {row + 1}",
         extra=extra,
         commanded=commanded,
-        notes=(*record.notes, *_trip(ticks["guard"], t)),
+        notes=(*record.notes, *foreign, *_trip(ticks["guard"], t)),
         mapping=mapping,
     )
+
+
+def _of_the_vehicle(path: Path, ticks: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The ticks that count the vehicle's clock, and what to say of the others: odometry of another component of the
+    network was flown then. Raises `InputError` where most ticks count other clocks."""
+    own = of_one_clock(ticks["vehicle_time"], ticks["host_time"])
+    if np.all(own):
+        return ticks, []
+    if np.mean(own) < MOST_OWN:
+        raise InputError(
+            f"{path}: the ticks count several clocks, and none of them most ({100 * np.mean(own):.0f} %): odometry of "
+            "other components was flown; take another record, and see that one component alone sends odometry"
+        )
+    kept = {name: column[own] for name, column in ticks.items()}
+    kept["t"] = kept["vehicle_time"] - kept["vehicle_time"][0]
+    return kept, [
+        f"{np.sum(~own)} of {len(own)} ticks count another clock (odometry of another component, or a vehicle that "
+        "began again) and are left out"
+    ]
 
 
 def _trip(guard: np.ndarray, t: np.ndarray) -> list[str]:

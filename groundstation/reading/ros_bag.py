@@ -18,6 +18,7 @@ import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Header, Message, Schema
 
+from trueflight.groundstation.reading.clocks import drift_of, of_one_clock
 from trueflight.groundstation.reading.px4_log import TOPICS, Log, collect
 from trueflight.groundstation.reading.ros_choice import choose
 from trueflight.groundstation.reading.ros_vehicles import Fields, Source
@@ -28,8 +29,9 @@ from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_fro
 from trueflight.models.mcap_records import mcap_records
 
 ADVICE = "record it with `ros2 bag record --storage mcap`, with the px4_msgs workspace sourced"
-OTHER_CLOCK = 60.0
-"""s; stamps further apart from the times of receipt than others count another clock (since boot, not since 1970)."""
+OTHER_CLOCK = 0.5
+"""s; stamps further apart from the times of receipt than others count another clock: since boot, not since 1970, or
+that of a computer that was not synchronised."""
 VELOCITY = ("twist.twist.linear.x", "twist.twist.linear.y", "twist.twist.linear.z")
 
 
@@ -43,7 +45,7 @@ class _Recorded:
     received: list[int] = field(default_factory=list)
     names: tuple[str, ...] = ()
     rows: list[tuple[float, ...]] = field(default_factory=list)
-    shift: int = 0
+    shift: float | np.ndarray = 0.0
 
     def columns(self) -> dict[str, np.ndarray]:
         """Fields (M,) by name."""
@@ -195,20 +197,37 @@ def _numbers(prefix: str, value: Any) -> Iterator[tuple[str, float]]:
 
 
 def _one_clock(recorded: list[_Recorded]) -> list[str]:
-    """Shift the stamps of topics that count another clock than the others."""
-    offsets = {id(one): float(np.median(np.array(one.received) - _stamp(one))) for one in recorded}
-    if not offsets:
-        return []
-    common = min(offsets.values(), key=abs)
-    moved = []
+    """Bring the stamps of all topics onto one clock by their times of receipt; messages of a second clock in one topic
+    are left out. What was done."""
+    notes = []
     for one in recorded:
-        apart = offsets[id(one)] - common
-        if abs(apart) > OTHER_CLOCK * 1e6:
-            one.shift = round(apart)
-            moved.append(one.topic)
-    if not moved:
-        return []
-    return [f"{len(moved)} topics count another clock and were shifted by their times of receipt"]
+        own = of_one_clock(1e-6 * _stamp(one), 1e-6 * np.array(one.received))
+        if not np.all(own):
+            notes.append(
+                f"{np.sum(~own)} of {len(own)} messages of {one.topic} count another clock than the others: left out"
+            )
+            one.rows = [row for row, kept in zip(one.rows, own, strict=True) if kept]
+            one.received = [when for when, kept in zip(one.received, own, strict=True) if kept]
+    drifts = [drift_of(1e-6 * _stamp(one), 1e-6 * np.array(one.received)) for one in recorded]
+    offsets = [float(np.median(np.array(one.received) - _stamp(one))) for one in recorded]
+    common = min(offsets, key=abs, default=0.0)
+    moved, ran = [], []
+    for one, drift, offset in zip(recorded, drifts, offsets, strict=True):
+        one.shift = 1e6 * drift
+        if np.any(drift):
+            ran.append(one.topic)
+        if abs(offset - common) > OTHER_CLOCK * 1e6:
+            one.shift = one.shift + (offset - common)
+            moved.append((one.topic, 1e-6 * (offset - common)))
+    if moved:
+        topic, most = max(moved, key=lambda pair: abs(pair[1]))
+        notes.append(
+            f"{len(moved)} topics count another clock and were shifted by their times of receipt ({topic} "
+            f"by {most:.4g} s)"
+        )
+    if ran:
+        notes.append(f"the clock of {', '.join(ran[:3])} drifts and was brought to the times of receipt")
+    return notes
 
 
 def _stamp(one: _Recorded) -> np.ndarray:

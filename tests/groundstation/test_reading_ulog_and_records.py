@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from trueflight.groundstation.reading import read_flight, segments
 from trueflight.models.errors import InputError
 from trueflight.models.frames import rotate, rotate_inverse
+from trueflight.models.record_pb2 import Tick
 from trueflight.models.vehicle import GRAVITY, load_vehicle
 
 ROOT = Path(__file__).parents[2]
@@ -132,3 +135,52 @@ def test_a_record_in_which_nothing_flew_is_told(record, tmp_path):
     path.write_bytes(content[:40_000])
     with pytest.raises(InputError, match=r"start\.mcap.*(in the air|never flew)"):
         read_flight(path)
+
+
+def with_foreign_ticks(record, path, every):
+    """The record with a tick of another component after each `every`, stamped by a clock that counts since 1970."""
+    with record.open("rb") as stream, path.open("wb") as out:
+        reader, writer = make_reader(stream), Writer(out)
+        writer.start()
+        schemas, channels = {}, {}
+        for number, (schema, channel, message) in enumerate(reader.iter_messages(log_time_order=False)):
+            if channel.id not in channels:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+                )
+            told = (
+                channels[channel.id],
+                message.log_time,
+                message.data,
+                message.publish_time,
+                message.sequence,
+            )
+            writer.add_message(*told)
+            if channel.topic == "/tick" and number % every == 0:
+                tick = Tick.FromString(message.data)
+                tick.vehicle_time_us += 1_795_708_709_000_000
+                tick.position.x += 5.0
+                writer.add_message(told[0], told[1], tick.SerializeToString(), told[3], told[4])
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(
+                attachment.create_time,
+                attachment.log_time,
+                attachment.name,
+                attachment.media_type,
+                attachment.data,
+            )
+        writer.finish()
+    return path
+
+
+def test_ticks_that_count_another_clock_are_read_around(record, tmp_path):
+    whole = read_flight(record)
+    flight = read_flight(with_foreign_ticks(record, tmp_path / "mixed.mcap", 7))
+    assert any("count another clock" in note for note in flight.notes)
+    assert len(flight) == len(whole)
+    np.testing.assert_allclose(flight.position, whole.position, atol=1e-9)
+    with pytest.raises(InputError, match="several clocks"):
+        read_flight(with_foreign_ticks(record, tmp_path / "half.mcap", 1))

@@ -3,12 +3,13 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from px4_layouts import BOOT, flown, log_of, middle_of
-from ros_bag_writer import EPOCH, HEADER, Bag, px4_topics, ros_messages
+from ros_bag_writer import EPOCH, HEADER, Bag, poses, px4_topics, ros_messages
 
 from trueflight.groundstation.reading import read_flight
 from trueflight.models.errors import InputError
@@ -122,3 +123,18 @@ def test_flights_lists_recordings_of_ros(tmp_path):
     (row,) = json.loads(done.stdout)
     assert row["error"] == "" and row["flying"] > 10.0
     assert BOOT > 0
+
+
+@pytest.mark.parametrize(
+    ("clock", "said"), [(lambda t: 3.0 + 0 * t, "by 3 s"), (lambda t: 0.02 * (t - BOOT), "drifts")]
+)
+def test_a_topic_of_a_computer_that_is_not_synchronised_is_brought_to_the_others(clock, said, tmp_path):
+    one, bag = flown(), ros_messages(Bag(tmp_path / "bag.mcap"), odometry=False)
+    bag.pending = [entry for entry in bag.pending if "/mocap/" not in entry[1]]
+    other = Bag(tmp_path / "none.mcap")
+    poses(other, "/mocap/pose", replace(one, t=one.t - clock(one.t)))
+    received = one.t[::2] + 0.003
+    bag.pending += [(when, *entry[1:]) for when, entry in zip(received, other.pending, strict=True)]
+    flight = read_flight(bag.save(), VEHICLE)
+    agrees(flight, ("position", "specific_force", "angular_velocity"), 4.0)
+    assert any(said in note and "/mocap/pose" in note for note in flight.notes)
