@@ -26,7 +26,7 @@ demo: setup
 # WORKERS processes: one flies in real time, which is mostly waiting, the others compute (tests/conftest.py). Three
 # keep two cores busy.
 WORKERS ?= 3
-PYTEST := $(BIN)/pytest -n $(WORKERS) --dist loadgroup --no-loadscope-reorder
+PYTEST := $(BIN)/pytest -n $(WORKERS)
 
 test: setup lint
 	$(PYTEST)

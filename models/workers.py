@@ -29,11 +29,19 @@ def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
 def interrupts_held() -> Iterator[None]:
     """Interrupts (Ctrl-C goes to every process of a terminal) and requests to end wait until the end of the block;
     processes that are started in it do not see them before they serve."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    numbers, held = (signal.SIGINT, signal.SIGTERM), list[int]()
+    # What this thread blocks the kernel gives to another one (OpenBLAS has some), and Python handles it here.
+    in_main = threading.current_thread() is threading.main_thread()
+    handlers = {n: signal.signal(n, lambda got, _: held.append(got)) for n in numbers} if in_main else {}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number, handler in handlers.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        for got in held[:1]:
+            signal.raise_signal(got)
 
 
 @contextmanager

@@ -100,7 +100,6 @@ def test_the_simulator(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.realtime
 def test_a_simulated_vehicle_and_its_pilot() -> None:
     own, pilot = free_port(), free_port()
     words = ["run", "--vehicle", VEHICLE, "--duration", 6, "--port", own, "--pilot-port", pilot, "--json"]

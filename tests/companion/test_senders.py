@@ -16,6 +16,8 @@ from test_companion_cli import companion, refused
 from trueflight.companion.batteries import Batteries
 from trueflight.companion.others import Others
 
+pytestmark = pytest.mark.realtime
+
 PX4, ARDUPILOT, GENERIC = 12, 3, 0
 QUADROTOR, FIXED_WING, VTOL, GIMBAL, GROUND_STATION = 2, 1, 22, 26, 6
 
@@ -50,7 +52,6 @@ def battery(number: int, volts: float, use: int = 0) -> Any:
     return mav.MAVLink_battery_status_message(number - 1, use, 1, 2000, cells + [65535] * 6, 50, 0, 0, 90)
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("kind", "autopilot", "says"),
     [
@@ -72,7 +73,6 @@ def test_what_cannot_be_flown_is_named(kind: int, autopilot: int, says: str) -> 
     assert "--connect" in line
 
 
-@pytest.mark.realtime
 def test_a_ground_station_alone_is_no_autopilot() -> None:
     port = free_port()
     speaker = Speaker(port, 255, 190, heartbeat(GROUND_STATION, 8))
@@ -91,7 +91,6 @@ def bridge() -> Iterator[int]:
     running.end()
 
 
-@pytest.mark.realtime
 def test_who_else_speaks_is_counted_and_a_low_battery_is_not_hidden(bridge: int) -> None:
     """A gimbal, a ground station and a camera's odometry; a second flight battery that is all but empty."""
     address = ("--connect", f"udpin://127.0.0.1:{bridge}")
