@@ -145,15 +145,9 @@ class Guard:
         acting = [(weight, watch.actuation) for watch, weight in self._weights.items() if weight > 0.0]
         if len(acting) < 2:
             return acting[0][1] if acting else ACTS_AT_ONCE
-        total = sum(weight for weight, _ in acting)
-        return Actuation(
-            *(
-                sum(w * n for w, n in column) / total
-                for column in zip(
-                    *([(weight, number) for number in astuple(one)] for weight, one in acting), strict=True
-                )
-            )
-        )
+        weights = [weight for weight, _ in acting]
+        columns = zip(*(astuple(one) for _, one in acting), strict=True)
+        return Actuation(*(_mean(weights, numbers) for numbers in columns))
 
     def step(
         self, rows: Sequence[Sequence[float]], ahead: float, dt: float, height: float = math.inf
@@ -234,6 +228,12 @@ class Guard:
             _toward(y, wanted[1], b * dt, v),
             _toward(z, wanted[2], c * dt, w),
         )
+
+
+def _mean(weights: Sequence[float], numbers: Sequence[float]) -> float:
+    """The weighted mean, between the numbers to the last bit: beyond a limit `Actuation` would refuse it."""
+    mean = sum(w * n for w, n in zip(weights, numbers, strict=True)) / sum(weights)
+    return min(max(numbers), max(min(numbers), mean))
 
 
 def _toward(now: float, wanted: float, step: float, authority: float) -> float:

@@ -281,6 +281,50 @@ def test_near_the_ground_a_model_may_add_thrust_but_take_little_away() -> None:
     assert applied(0.1 * limits.ground, -3.0) == pytest.approx(-3.0)
 
 
+def test_without_limits_of_its_own_a_guard_fades_in_a_second_and_a_model_has_2_ms_a_tick() -> None:
+    clock, takes = Clock(), [0.0]
+
+    def model(features):
+        clock.now += takes[0] / 3.0  # three moments a tick
+        return (0.1, 0.0, 1.0)
+
+    def begun() -> Guard:
+        guard = guard_of(model, GuardLimits(), clock=clock)
+        guard.start()
+        return guard
+
+    guard = begun()
+    run(guard, 0.99)
+    assert guard.status == "fading_in"
+    run(guard, 0.02)
+    assert guard.status == "active"
+    lifts = [guard.step([INSIDE] * 3, 0.02, 0.1, height).applied[2] for height in (0.0, 0.1, 0.5)]
+    assert lifts == pytest.approx([0.0, 0.2 * 4.0, 1.0]), "0.5 m above the ground all of it acts"
+    for takes[0], ticks in ((0.0019, 100), (0.0021, 4), (0.0, 1), (0.049, 1)):
+        for _ in range(ticks):
+            step(guard, INSIDE, DT)
+    assert not guard.tripped
+    for takes[0], ticks in ((0.0021, 5), (0.051, 1)):
+        guard = begun()
+        for _ in range(ticks):
+            step(guard, INSIDE, DT)
+        assert guard.tripped
+
+
+def test_after_a_gap_a_tick_moves_on_by_a_tenth_of_a_second() -> None:
+    guard = guard_of(constant(2.0), GuardLimits(slew=(8.0, 8.0, 8.0), fade=1.0))
+    guard.start()
+    step(guard, INSIDE, 100.0)
+    assert guard.engaged == pytest.approx(0.1)
+    run(guard, 2.0)
+    guard.stop()
+    before = guard.applied[0]
+    assert step(guard, INSIDE, 100.0)[0][0] == pytest.approx(before - 0.1 * 2.0)
+    guard = guard_of(constant(2.0), GuardLimits(slew=(8.0, 8.0, 8.0), fade=1e-3))
+    guard.start()
+    assert step(guard, INSIDE, 100.0)[0][0] == pytest.approx(0.1 * 8.0)
+
+
 def test_a_gap_gives_no_jump() -> None:
     guard = guard_of(constant(2.0), GuardLimits(fade=0.01))
     guard.start()

@@ -191,6 +191,16 @@ def test_a_vehicle_that_tumbles_for_more_than_half_a_second_gets_nothing_more(
     assert set(flight.lasting(20, quaternion=turned(1.39), land_asked=land_asked)) == {()}
 
 
+def test_half_a_second_of_tumbling_is_half_a_second() -> None:
+    flight = Watched()
+    flight.look(quaternion=tilted(2.0))
+    begun = flight.odometry.vehicle_time_us
+    flight.odometry = flight.odometry._replace(vehicle_time_us=begun + 499_000 - EIGHTH)
+    assert flight.look(quaternion=tilted(2.0)) == ()
+    flight.odometry = flight.odometry._replace(vehicle_time_us=begun + 501_000 - EIGHTH)
+    assert [stop.kind for stop in flight.look(quaternion=tilted(2.0))] == ["tumbled"]
+
+
 def test_turned_about_the_vertical_a_vehicle_has_not_tumbled() -> None:
     assert set(Watched().lasting(20, quaternion=(0.0, 0.0, 0.0, 1.0))) == {()}
 

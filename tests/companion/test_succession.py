@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from dataclasses import astuple
 from itertools import pairwise
 
@@ -16,6 +17,7 @@ from trueflight.companion.law.guard import Guard
 from trueflight.companion.law.watch import GuardLimits, Range, Watch
 from trueflight.companion.shadow import Shadow, ShadowLimits, error_acceleration
 from trueflight.models import frames
+from trueflight.models.contract import ACTUATION_LIMITS
 
 LIMITS = GuardLimits(fade=0.5)
 RANGES = (Range("z", "m", 0.0, 2.0), Range("vx", "m/s", -2.0, 2.0))
@@ -319,6 +321,42 @@ def test_what_is_known_of_the_actuation_changes_over_with_the_models() -> None:
     )
     run(guard, 0.5)
     assert guard.actuation == quick
+
+
+def test_while_the_correction_is_half_in_the_actuation_is_known_all_the_same() -> None:
+    slow, quick = Actuation(0.03, 0.06, 2.0, 0.01, 0.04), Actuation(0.01, 0.02, 1.0, 0.03, 0.02)
+    guard = Guard(one((0.0, 0.0, 0.0), "a", actuation=slow))
+    guard.start()
+    run(guard, 0.25)
+    assert guard.actuation is slow, "one model acts: it is as that model knows it, to the last bit"
+    guard.succeed(one((0.0, 0.0, 0.0), "b", actuation=quick))
+    run(guard, 0.125)
+    guard.stop()
+    run(guard, 0.05)
+    assert 0.0 < guard.engaged < 0.5
+    weighted = astuple(guard.actuation)
+    for number, a, b in zip(weighted, astuple(slow), astuple(quick), strict=True):
+        assert min(a, b) < number < max(a, b), "between the two models', however little of both acts"
+
+
+def test_however_the_ticks_fall_no_more_than_all_acts_and_nothing_known_leaves_its_limits() -> None:
+    most = Actuation(**ACTUATION_LIMITS)
+    for seed in (*range(20), 1207, 1815):  # the last two once summed to more than 1 by the last bit
+        draw = random.Random(seed)
+        limits = GuardLimits(fade=draw.choice([0.3, 0.5, 0.7, 1.0]))
+
+        def model(name: str, limits: GuardLimits = limits) -> Watch:
+            return Watch(constant(0.0), RANGES, limits, name=name, actuation=most)
+
+        guard = Guard(model("a"))
+        guard.start()
+        for i in range(25):
+            guard.step([INSIDE] * 3, AHEAD, draw.choice([0.01, 0.02, 0.033, 0.1]))
+            assert guard.engaged <= 1.0, "to the last bit, or a limit times it is beyond the limit"
+            assert guard.actuation == most
+            assert guard.actuation.scaled(guard.engaged) != ACTS_AT_ONCE
+            if draw.random() < 0.3:
+                guard.succeed(model(f"b{i}"))
 
 
 def test_yaw_is_told_to_models_as_long_as_one_of_them_wants_it() -> None:
