@@ -85,7 +85,7 @@ class Process:
             self.send(signal.SIGCONT)
             self.send(number)
         try:
-            return self.child.wait(30.0)
+            return self.child.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             self.send(signal.SIGKILL)
             raise AssertionError(f"did not end after signal {number}:\n{self.output}") from None

@@ -157,7 +157,7 @@ def test_a_real_companion_flies_a_mission_of_the_database(tmp_path):
     finally:
         for child in reversed(running):
             child.send_signal(signal.SIGTERM)
-            child.wait(30)
+            child.wait(90)
     (name,) = json.loads(told.stdout)["flights"]
     (sortie,) = database(6, 0.1)
     ticks = read_record(tmp_path / "db" / name).ticks

@@ -52,6 +52,6 @@ def bridge(tmp_path: Path) -> Iterator[Callable[..., Bridge]]:
     for process in running:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=10)
+        _, errors = process.communicate(timeout=60)
         assert process.returncode == 0, errors
         assert "Traceback" not in errors

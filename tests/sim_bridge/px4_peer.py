@@ -50,7 +50,7 @@ class Sensed:
 class Px4Peer:
     """The connection. `next()` gives the next step's sensors, `answer()` sends motor commands for it."""
 
-    def __init__(self, port: int, timeout: float = 20.0) -> None:
+    def __init__(self, port: int, timeout: float = 60.0) -> None:
         end = time.monotonic() + timeout
         while True:
             try:

@@ -65,7 +65,7 @@ class Running:
 
     def end(self) -> tuple[int, str, list[dict[str, Any]]]:
         """Exit code, standard error and all events, once it has ended by itself."""
-        out, errors = self.process.communicate(timeout=30)
+        out, errors = self.process.communicate(timeout=60)
         self.events += [valid("sim-bridge sitl", json.loads(line)) for line in out.splitlines()]
         return self.process.returncode, errors, self.events
 
@@ -105,7 +105,7 @@ def sitl(tmp_path: Path) -> Iterator[Callable[..., Running]]:
     for one in running:
         if one.process.poll() is None:
             one.process.send_signal(signal.SIGINT)
-        _, errors = one.process.communicate(timeout=15)
+        _, errors = one.process.communicate(timeout=60)
         assert "Traceback" not in errors
 
 
