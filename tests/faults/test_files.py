@@ -137,7 +137,9 @@ def test_a_serial_address_without_baud_rate_shows_the_right_form(address: str) -
     for command in (["run"], ["preflight"]):
         words = [BIN / "companion", *command, "--vehicle", QUAD5 / "vehicle.toml", "--connect", address]
         done = subprocess.run(words, capture_output=True, text=True, timeout=60)
-        assert done.returncode == 2 and "write --connect serial:///dev/ttyACM0:921600" in done.stderr, done.stderr
+        assert done.returncode == 2 and "write --connect serial:///dev/ttyACM0:921600" in done.stderr, (
+            done.stderr
+        )
         assert len(done.stderr.splitlines()) == 1
 
 
