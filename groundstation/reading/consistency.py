@@ -48,6 +48,7 @@ REFUSED_ANGLE = np.radians(15.0)
 then on the wrong axis."""
 TOLD_ANGLE = np.radians(4.0)
 """Turn from which on it is told; compasses and motion capture are aligned within a few degrees."""
+TOO_LITTLE = "the flight moves too little to compare them"
 UNTOLD = "the accelerometer feels too little along x and y to tell where they point: drag and wind rest on its mounting"
 LATEST, TOLD_LATE, UNTOLD_LATE = 0.3, 0.015, 0.05
 """s of delay that are looked for, from which on one is told and undone, and from which on it is told that the flight
@@ -93,7 +94,9 @@ def reconcile(t: np.ndarray, columns: Columns, flying: np.ndarray) -> Reconciled
     columns = {name: column[keep] for name, column in columns.items()}
     checks = _examined(Windows(t[keep], flying[keep], rates), columns, late)
     notes += [c.text for c in checks if c.verdict in ("undone", "weak")]
-    notes += [c.text for c in late if c.verdict == "agrees"]
+    if still := [c.pair for c in checks if c.text == TOO_LITTLE]:
+        notes.append(f"{', '.join(still)}: {TOO_LITTLE}; axes, units and frames are taken as they stand")
+    notes += [c.text for c in checks if c.verdict == "agrees" and c.text and c.text != UNTOLD]
     return Reconciled(keep, columns, checks, rates, tuple(notes))
 
 
@@ -108,8 +111,7 @@ def _examined(windows: Windows, columns: Columns, late: list[Check]) -> tuple[Ch
     """A check for every pair that the columns allow; `late` tells what was undone before."""
     pairs = windows.pairs(columns)
     moving = [p for p in pairs if p.moves]
-    too_little = "the flight moves too little to compare them"
-    still = [Check(p.name, "cannot tell", float("nan"), too_little) for p in pairs if not p.moves]
+    still = [Check(p.name, "cannot tell", float("nan"), TOO_LITTLE) for p in pairs if not p.moves]
     fault = _likeliest(windows, columns, moving)
     if fault is not None or any(p.left > DISAGREE for p in moving):
         return (*_disagreements(windows, columns, moving, fault), *still)
@@ -126,7 +128,9 @@ def _examined(windows: Windows, columns: Columns, late: list[Check]) -> tuple[Ch
 def _agreement(windows: Windows, columns: Columns, pair: Pair) -> Check:
     """That a pair agrees. Beside the thrust an accelerometer feels little along x and y, and agrees wherever they are:
     they are looked at alone. Told where they seem to point elsewhere, or where the flight does not tell it."""
-    if pair.name != FORCE or "specific_force" not in columns:
+    if pair.name == TILT:
+        return Check(pair.name, "agrees", pair.left, _unsure_axes(windows, columns, pair))
+    if pair.name != FORCE:
         return Check(pair.name, "agrees", pair.left)
     name = "specific_force"
     faults = [f for f in single_faults({name: columns[name]}) if f.axes is not None and f.axes[2, 2] == 1.0]
@@ -146,6 +150,24 @@ def _agreement(windows: Windows, columns: Columns, pair: Pair) -> Check:
         return Check(pair.name, "weak", pair.left, text, fault.mapping, fault.angle)
     told = all(other.likelihood(pair.left) > SURE for other, _ in others)
     return Check(pair.name, "agrees", pair.left, "" if told else UNTOLD)
+
+
+def _unsure_axes(windows: Windows, columns: Columns, pair: Pair) -> str:
+    """Which axes of the trajectory could as well be others, for all that the tilt tells; '' where none."""
+    names = _trajectory(columns)
+    unsure: set[str] = set()
+    for fault in single_faults({n: columns[n] for n in names}):
+        # whether z points up is told by the thrust
+        if fault.axes is not None and fault.names == names and fault.axes[0, 0] * fault.axes[1, 1] != 1.0:
+            other = windows.pair(TILT, fault.mend(columns))
+            if other.likelihood(pair.left) < SURE:
+                unsure |= {axis for k, axis in enumerate("xyz") if fault.axes[k, k] != 1.0}
+    if not unsure:
+        return ""
+    return (
+        f"{' and '.join(sorted(unsure))} of {' and '.join(names)} could be other axes of the log's: the flight moves "
+        "too little along them to tell"
+    )
 
 
 def refusal(checks: tuple[Check, ...]) -> str:

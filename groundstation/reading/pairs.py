@@ -98,11 +98,9 @@ class Windows:
         self.turn = max(1, round(max(TURN, *turning, 0.0) / self.dt))
         self.move = max(1, round(max(MOVE, *moving, 0.0) / self.dt))
         no = np.empty(0)
-        self._turned: tuple[np.ndarray, np.ndarray, np.ndarray] = (
-            no,
-            no,
-            no,
-        )  # attitude, force, and what became of them
+        # attitude and force, and the attitude, with what became of them
+        self._turned: tuple[np.ndarray, np.ndarray, np.ndarray] = (no, no, no)
+        self._leaned: tuple[np.ndarray, np.ndarray] = (no, no)
 
     def rows(self, width: int, reach: int = 0) -> np.ndarray:
         """First rows of windows of `width` samples in the air, with `reach` more on either side, a quarter apart."""
@@ -197,9 +195,10 @@ class Windows:
         """What the velocity gains along the horizontal, and what a thrust along the body's z that carries the vehicle
         gives there, with the velocity beside."""
         q, velocity = columns["quaternion"], self._velocity(columns)
-        up = rotate(q, np.tile([0.0, 0.0, 1.0], (len(q), 1)))
-        lean = up[:, :2] / np.where(np.abs(up[:, 2:]) < 0.1, 0.1, up[:, 2:])
-        felt = self.mean(lean, rows, self.move) * (gained[:, 2:] + GRAVITY)
+        if self._leaned[0] is not q:
+            up = rotate(q, np.tile([0.0, 0.0, 1.0], (len(q), 1)))
+            self._leaned = (q, up[:, :2] / np.where(np.abs(up[:, 2:]) < 0.1, 0.1, up[:, 2:]))
+        felt = self.mean(self._leaned[1], rows, self.move) * (gained[:, 2:] + GRAVITY)
         flown = self.mean(velocity, rows + shift, self.move)[:, :2]
         centre = (lambda a: a - a.mean(0)) if len(rows) else (lambda a: a)
         pair = self._pair(TILT, gained[:, :2], centre(felt), rows, self.move, GAINS)
