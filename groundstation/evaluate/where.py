@@ -8,13 +8,22 @@ import numpy as np
 
 from trueflight.groundstation.results import Comparison, ErrorMap, Moment, PlaceMap, Region, WhereItFails
 from trueflight.models.flight import Flight
-from trueflight.models.frames import rotation_matrix
+from trueflight.models.frames import (
+    euler_from_quaternion,
+    rotate_inverse,
+    rotation_matrix,
+    world_from_heading,
+)
 
 BINS = 16
 FINE = 40
 """Quantiles between which the edges of a region are sought."""
 CELL = 0.5
 """m, side of a cell of the map over the ground."""
+MOSTLY = 0.5
+"""Part of the squared error from which a constant is told."""
+ALIKE = 0.02
+"""Difference of that part within which a constant is one in both axes: the flight does not tell them apart."""
 MOMENT = 1.0
 """s, length of a worst moment."""
 
@@ -34,7 +43,10 @@ def where_it_fails(comparison: Comparison, bins: Mapping[str, np.ndarray] | None
     ]
     regions.sort(key=lambda r: r.share_of_time - r.share_of_error)
     return WhereItFails(
-        maps, tuple(regions), _worst(comparison, error, variables), _place(flight, used, error)
+        maps,
+        (*_constant(comparison), *regions),
+        _worst(comparison, error, variables),
+        _place(flight, used, error),
     )
 
 
@@ -143,6 +155,34 @@ def _worst(
         moments.append(Moment(start, end, float(np.sqrt(score[k])), told))
         score[max(0, k - width) : k + width] = -1.0
     return tuple(moments)
+
+
+def _constant(comparison: Comparison) -> tuple[Region, ...]:
+    """A constant that holds most of the squared error, in the axes in which it is one: wind and a slope in the world's,
+    drag at a steady course in those of the heading, a bias or a thrust in the body's."""
+    flight, used = comparison.flight, comparison.used
+    heading = np.nan_to_num(comparison.residual[used])
+    turned = {"the world": heading, "heading": heading, "body": heading}
+    if flight.quaternion is not None:
+        q = flight.quaternion[used]
+        turned["the world"] = world_from_heading(heading, euler_from_quaternion(q)[:, 2])
+        turned["body"] = rotate_inverse(q, turned["the world"])
+    total = max(float(np.mean(np.sum(heading**2, axis=1))), 1e-30)
+    means = {frame: column.mean(axis=0) for frame, column in turned.items()}
+    shares = {frame: float(np.sum(mean**2)) / total for frame, mean in means.items()}
+    best = max(shares, key=lambda frame: shares[frame])
+    if shares[best] < MOSTLY:
+        return ()
+    alike = [frame for frame in shares if shares[frame] > shares[best] - ALIKE]
+    axes = ("east", "north", "up") if best == "the world" else ("forward", "left", "up")
+    size = float(np.linalg.norm(means[best]))
+    told = ", ".join(
+        f"{v:+.2f} m/s² {axis}" for v, axis in zip(means[best], axes, strict=True) if abs(v) > 0.2 * size
+    )
+    frames = " and ".join(alike if len(alike) < 3 else ["the world", "heading", "body"])
+    text = f"{shares[best]:.0%} of the squared error is a constant in {frames} axes: {told}"
+    text = text.replace("the world axes", "the world's axes").replace("%", " %")
+    return (Region(text, f"constant, {best}", size, size, shares[best], 1.0),)
 
 
 def _place(flight: Flight, used: np.ndarray, error: np.ndarray) -> PlaceMap | None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage, signal, stats
 
+from trueflight.groundstation.identify.spectrum import own_period
 from trueflight.groundstation.measured.bins import bins
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.groundstation.results import Misfit
@@ -150,7 +151,8 @@ def _line(m: Measurement, column: np.ndarray, s: Spectrum, beyond: float) -> tup
     beside = (np.abs(s.frequency - f) <= 3.0 * width) & ~near & (s.frequency >= first)
     if above[beside].sum() > 0.5 * above[near].sum():
         return "", 0.0
-    return f"{f:.2g} Hz{_course(m, column, f)}", min(held, 1.0)
+    own = ", at which the flight itself repeats" if own_period(m.flight, f) else ""
+    return f"{f:.2g} Hz{_course(m, column, f)}{own}", min(held, 1.0)
 
 
 def _course(m: Measurement, column: np.ndarray, f: float) -> str:

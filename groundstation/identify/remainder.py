@@ -59,7 +59,11 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
     constant = _constant(measurement, residual)
     lines = spectral_lines(measurement, residual)
     heard = [
-        line for line in lines if line.in_band and _material(len(residual) * line.rms**2 / total, residual)
+        line
+        for line in lines
+        if line.in_band
+        and _material(len(residual) * line.rms**2 / total, residual)
+        and not any(x.held and x.low <= line.frequency <= x.high for x in beyond)
     ]
     swinging = residual - residual.mean(axis=0)
     study = _study(measurement, swinging)

@@ -1,9 +1,10 @@
-"""Narrow lines in the spectrum of what a model leaves over: vibration, or a loop that oscillates.
+"""Narrow lines in the spectrum of what a model leaves over: vibration, a loop that oscillates, a load that swings.
 
 Each segment's periodogram is divided by the running median of its own neighbourhood, so that a burst counts no more
 than a quiet stretch, and then averaged (Welch 1967). Under noise of a smooth spectrum an average over K independent
 segments has a gamma distribution of shape K, which gives each peak its significance, shared by all frequencies and
-axes (Bonferroni).
+axes (Bonferroni). Slower than segments resolve, down to a few periods a flight, the periodogram of all of it is held
+against its own neighbourhood in the same way.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from scipy import ndimage, signal, stats
 
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.groundstation.results import SpectralLine
+from trueflight.models.flight import Flight
 
 FAMILY = 0.01
 """Probability that noise shows any line at all."""
@@ -21,7 +23,13 @@ SEGMENT = 4.0
 NEIGHBOURHOOD = 5.0
 """Hz of the running median that tells what noise does here; a peak much wider than a tenth of it is no line."""
 LOWEST = 0.5 * NEIGHBOURHOOD
-"""Hz below which there is no neighbourhood, and the flight's own motion fills the spectrum."""
+"""Hz below which segments have no neighbourhood: slower lines are looked for in the flight as a whole."""
+PERIODS = 4
+"""Periods a flight of the slowest line: fewer are a wander."""
+WIDE = 0.3
+"""Part of a slow line's frequency on either side that is its neighbourhood."""
+REPEATS = 5.0
+"""Times its neighbourhood at which the flight's own motion counts as a period."""
 MATERIAL = 0.03
 """m/s² RMS of a line."""
 MOST_LINES = 4
@@ -37,6 +45,7 @@ def spectral_lines(measurement: Measurement, residual: np.ndarray) -> tuple[Spec
     placed = np.full((len(m.t), residual.shape[1]), np.nan)
     placed[m.used] = residual
     found = _lines(placed, period, LOWEST, m.bandwidth, m.axes)
+    found += _slow_lines(np.nan_to_num(placed), period, m.axes)
     if flight.specific_force is not None and flight.accelerometer and 0.5 / flight.dt > 1.2 * m.bandwidth:
         raw = flight.specific_force.copy()
         if flight.flying is not None:
@@ -79,6 +88,62 @@ def _lines(
     return found
 
 
+def _slow_lines(
+    columns: np.ndarray, period: float, axes: tuple[int, ...]
+) -> list[tuple[float, int, float, float]]:
+    """Frequency, axis, RMS and p-value of each line below `LOWEST` of columns (N, A), zero where nothing counts."""
+    frequency, power = _whole(columns, period)
+    inside = (frequency >= PERIODS * frequency[1]) & (frequency < LOWEST)
+    found = []
+    for column, axis in enumerate(axes):
+        ratio = np.where(inside, power[:, column] / _neighbours(frequency, power[:, column]), 0.0)
+        for peak in signal.find_peaks(ratio, distance=PERIODS)[0]:
+            p = float(np.exp(-ratio[peak])) * int(inside.sum()) * len(axes)
+            # the window spreads a line over three frequencies
+            around = slice(max(peak - 2, 0), peak + 3)
+            rms = float(np.sqrt(power[around, column].sum()))
+            if p < FAMILY and rms > MATERIAL:
+                f = float(np.average(frequency[around], weights=power[around, column]))
+                found.append((f, axis, rms, p))
+    return found
+
+
+def _whole(columns: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (F,) and mean square by frequency (F, A) of a flight as a whole, Hann window."""
+    window = signal.windows.hann(len(columns), sym=False)
+    power = np.abs(np.fft.rfft((columns - columns.mean(axis=0)) * window[:, None], axis=0)) ** 2
+    scale = 2.0 / (len(columns) * np.sum(window**2))
+    return np.fft.rfftfreq(len(columns), period), scale * power
+
+
+def _neighbours(frequency: np.ndarray, power: np.ndarray) -> np.ndarray:
+    """What noise does around each frequency (F,): the median over a band that widens with it."""
+    out = np.empty(len(power))
+    last = int(np.searchsorted(frequency, 2.0 * LOWEST))
+    for k in range(len(power)):
+        half = max(2 * PERIODS, round(WIDE * k))
+        out[k] = np.median(power[max(k - half, 1) : k + half + 1]) if k <= last else np.inf
+    return np.maximum(out / np.log(2.0), 1e-30)
+
+
+def own_period(flight: Flight, frequency: float) -> bool:
+    """Whether the flight itself repeats at this frequency, Hz: its references, or its motion without them."""
+    columns = flight.position_reference if flight.position_reference is not None else flight.velocity
+    if columns is None or frequency > LOWEST:
+        return False
+    flown = slice(None) if flight.flying is None else flight.flying
+    grid, power = _whole(np.nan_to_num(columns[flown]), flight.dt)
+    if frequency < 2.0 * grid[1]:
+        return False
+    near = np.abs(grid - frequency) <= max(1.5 * grid[1], 0.05 * frequency)
+    for column in power.T:
+        peak = float(column[near].max(initial=0.0))
+        beside = (np.abs(grid - frequency) < max(0.5 * frequency, 4.0 * grid[1])) & ~near
+        if peak > REPEATS * max(float(np.mean(column[beside])), 1e-30) and peak > 0.01 * float(column.sum()):
+            return True
+    return False
+
+
 def _spectra(columns: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Frequencies (F,), power densities (S, F, A) of segments, and how many independent segments they are worth."""
     length = round(SEGMENT / period)
@@ -102,6 +167,10 @@ def _cause(m: Measurement, frequency: float) -> str:
     """What a line at this frequency may be."""
     flight = m.flight
     rate = 1.0 / flight.dt
+    if frequency < LOWEST:
+        if own_period(flight, frequency):
+            return "the flight itself repeats at that rate: what goes with its motion looks the same"
+        return "the flight does not repeat at that rate: gusts, a load that swings, or a loop that does"
     if flight.rotor_speed is not None:
         flying = slice(None) if flight.flying is None else flight.flying
         turns = flight.rotor_speed[flying] / (2.0 * np.pi)

@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 from simulated import simulated
 
+from trueflight.groundstation.evaluate.compare import compare
+from trueflight.groundstation.evaluate.where import where_it_fails
+from trueflight.groundstation.identify.spectrum import spectral_lines
 from trueflight.groundstation.identify.translation import diagnose
-from trueflight.groundstation.results import Diagnosis
+from trueflight.groundstation.measured.measurement import measure
+from trueflight.groundstation.results import Diagnosis, SpectralLine
 from trueflight.models.flight import Flight
 from trueflight.models.frames import rotate_inverse
 from trueflight.models.model import rigid_body_model
@@ -57,3 +61,33 @@ def test_a_misfit_is_judged_axis_by_axis() -> None:
     found = said_of(replace(flight, specific_force=force))
     assert [(x.frame, x.axis) for x in found.unexplained.misfit] == [("body", "y")]
     assert found.named("missing") == ()
+
+
+def test_a_constant_is_told_in_the_axes_in_which_it_is_one() -> None:
+    flight = simulated(3, "none")
+    turned = rotate_inverse(flight.quaternion, np.array([0.9, 0.0, 0.0]))
+    for force, frame in ((turned, "the world"), (np.array([0.9, 0.0, 0.0]), "body")):
+        bad = replace(flight, specific_force=flight.specific_force + force)
+        first = where_it_fails(compare(bad, rigid_body_model(flight.vehicle), horizons=False)).regions[0]
+        assert first.variable == f"constant, {frame}"
+        assert first.low == pytest.approx(0.9, rel=0.02)
+    assert "+0.90 m/s² forward" in first.text
+
+
+def test_a_slow_line_is_found_and_the_flights_own_period_named() -> None:
+    flight = simulated(8, "none", kind="lemniscate")
+    t = flight.t - flight.t[0]
+    m = measure(flight)
+    rng = np.random.default_rng(0)
+
+    def lines(hz: float) -> tuple[SpectralLine, ...]:
+        noise = rng.normal(0.0, 0.05, (len(m.t), 3))
+        noise[:, 1] += 0.3 * np.sin(2.0 * np.pi * hz * t[m.rows])
+        return spectral_lines(m, noise[m.used])
+
+    (found,) = lines(0.7)
+    assert found.axis == "y" and found.in_band
+    assert found.frequency == pytest.approx(0.7, abs=0.5 / flight.duration)
+    assert found.rms == pytest.approx(0.3 / np.sqrt(2.0), rel=0.15)
+    assert "does not repeat" in found.text
+    assert spectral_lines(m, rng.normal(0.0, 0.05, (int(m.used.sum()), 3))) == ()
