@@ -216,7 +216,8 @@ class EffectVerdict:
 
     `verdict` is one of missing, possible, not_supported, not_excited, included. `variance_share` is the part
     of the squared error before that the effect takes away, given the others; `p_value` robust to autocorrelation.
-    `rests_on` tells what the verdict stands on where more is left than noise. `seen_in` is "acceleration" or
+    `rests_on` tells what the verdict stands on where more is left than noise. `undetermined` are parameters that this
+    flight does not determine, `products` what it determines of them instead. `seen_in` is "acceleration" or
     "rotation": shares and ranks are each among their own.
     """
 
@@ -230,6 +231,8 @@ class EffectVerdict:
     advice: str
     seen_in: str = "acceleration"
     rests_on: str = ""
+    undetermined: tuple[str, ...] = ()
+    products: tuple[ParameterEstimate, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -251,7 +254,8 @@ class Diagnosis:
     RMS on the held-out flight, None without one. `clock_shift` is by how much later than its vehicle file says the
     command acts, s, None where no clock was fitted. `unexplained` tells whether predictable structure is left;
     `left_out` the share of the samples that did not count, by reason. `rotational` is the residual of the angular
-    acceleration, None where it was not seen.
+    acceleration, None where it was not seen; `alternatives` are other sets of effects that explain the flight nearly as
+    well as those found.
     """
 
     flight: Flight
@@ -269,6 +273,7 @@ class Diagnosis:
     unexplained: Unexplained
     left_out: dict[str, float]
     rotational: RotationalRms | None = None
+    alternatives: tuple[tuple[str, ...], ...] = ()
 
     def named(self, verdict: str) -> tuple[str, ...]:
         """Names of the effects with this verdict, in order of rank."""

@@ -4,7 +4,9 @@ Least squares takes what is left for noise that averages out. A misfit does not:
 curve. Here every parameter is estimated a second time with each frequency weighted by what is left at it (Whittle
 1953), so that a slow misfit leaves the quick part of the flight to speak. An effect that is there has the same size at
 every frequency (a specification test: Hausman, Econometrica 46, 1978), in every part of the flight (Chow,
-Econometrica 28, 1960), and where the thrust's scale may wander; one that stands in for something else has not.
+Econometrica 28, 1960), and where the thrust's scale may wander; one that stands in for something else has not. And what
+does less than what is left at its own frequencies and axes may be a part of that (a discrepancy in the sense of Kennedy
+& O'Hagan, J. R. Stat. Soc. B 63, 2001, knows no bounds but its size).
 """
 
 from __future__ import annotations
@@ -24,6 +26,9 @@ NARROWEST = 2
 SAME = 1.0 / 3.0
 """Part of what an effect does by which frequencies or parts of the flight may differ: lags of some ms and a law that is
 not quite that of the vehicle make a quarter."""
+MASTERED = 0.5
+"""Most that may be left at an effect's own frequencies, over what it does, both RMS: what does not twice outweigh a
+discrepancy may be made of it."""
 PARTS = 8
 """Parts of a flight in which an effect is to have the same size."""
 ALPHA = 0.01
@@ -36,8 +41,9 @@ class Weighed:
 
     `size` and `spread` are the estimate of each of its numbers, less "no effect", and its standard deviation. By
     `moved` of its size it differs from the plain estimate, by `varies` over the parts of the flight; 0 where chance
-    makes as much; by `shared` it changes where each part of the flight has a scale of thrust of its own. `p_value` is
-    that of no effect.
+    makes as much; by `shared` it changes where each part of the flight has a scale of thrust of its own. `beside` is
+    what is left beyond the noise where the effect acts, over what the effect does there, in squares. `p_value` is that
+    of no effect.
     """
 
     size: np.ndarray
@@ -45,6 +51,7 @@ class Weighed:
     moved: float
     varies: float
     shared: float
+    beside: float
     p_value: float
 
     @property
@@ -55,13 +62,15 @@ class Weighed:
     @property
     def holds(self) -> bool:
         """Whether it is there whatever else is."""
-        return self.steady and self.p_value < ALPHA
+        return self.steady and self.p_value < ALPHA and self.beside < MASTERED**2
 
     @property
     def told(self) -> str:
         """What a verdict on it rests on."""
         if self.p_value >= ALPHA:
             return "weighed with the spectrum of what is left, it may be nothing"
+        if self.beside >= MASTERED**2:
+            return "it does less than twice what is left unexplained at the same frequencies"
         if self.steady:
             return "of one size at every frequency and throughout the flight, beside what is left unexplained"
         worst, why = max(
@@ -82,6 +91,7 @@ class Weighing:
         normal = np.zeros((count, count))  # of least squares
         meat, weighted = normal.copy(), normal.copy()
         pull, at = np.zeros(count), 0
+        self._seen: list[tuple[np.ndarray, np.ndarray]] = []  # beyond the noise, and the Jacobian, by axis
         for m in measurements:
             rows = slice(at, at + int(m.used.sum()))
             at = rows.stop
@@ -96,6 +106,8 @@ class Weighing:
                     _smoothed(np.abs(r[:, axis]) ** 2), float(m.used.sum()) * floor[axis] ** 2 * 1e-3
                 )
                 outer = 2.0 * np.real(np.einsum("fp,fq->fpq", np.conj(j[:, axis]), j[:, axis]))
+                noise = float(m.used.sum()) * floor[axis] ** 2
+                self._seen.append((np.maximum(density - noise, 0.0), j[:, axis]))
                 normal += outer.sum(axis=0)
                 meat += np.einsum("f,fpq->pq", density, outer)
                 weighted += np.einsum("f,fpq->pq", 1.0 / density, outer)
@@ -127,6 +139,7 @@ class Weighing:
             self._moved(own, step, plain) if p_apart < ALPHA else 0.0,
             self._varies(own, plain),
             self._shared(effect, own, plain),
+            self._beside(own, plain),
             float(stats.chi2.sf(statistic, len(own))),
         )
 
@@ -166,6 +179,13 @@ class Weighing:
             flat.T @ self.here.residual.ravel()
         )
         return self._moved(own, (step / size)[own], plain)
+
+    def _beside(self, own: list[int], plain: np.ndarray) -> float:
+        """What is left beyond the noise over what the effect does, both squared, at the frequencies and on the axes at
+        which it acts."""
+        done = [np.abs(j[:, own] @ plain) ** 2 for _, j in self._seen]
+        left = sum(float(np.sum(e * beyond)) for e, (beyond, _) in zip(done, self._seen, strict=True))
+        return left / max(sum(float(np.sum(e * e)) for e in done), 1e-30)
 
     def _parts(self) -> np.ndarray:
         """Which part of the flights each used sample is of, (K,)."""

@@ -249,11 +249,13 @@ def fit(
     refit: Sequence[str] | None = None,
     clock: bool = True,
     tolerance: float = 1e-6,
+    pinned: Mapping[tuple[str, str], float] | None = None,
 ) -> Fit:
     """Fit the parameters of `terms` (all of them, or the effects named in `refit`) to the flights.
 
     With `clock`, the delay between the columns is free within one sample of what the vehicle file says: no log's
-    clock is better than that, and a shift must not be taken for drag.
+    clock is better than that, and a shift must not be taken for drag. `pinned` holds numbers, by effect and parameter,
+    where they are.
     """
     vehicle, names = problem.vehicle, [t.effect for t in terms]
     fixed = {t.effect: dict(t.values) for t in terms}
@@ -263,6 +265,9 @@ def fit(
         effect = effect_named(term.effect, problem.effects_directory)
         if (refit is None or term.effect in refit) and not effect.rotational:
             free += free_parameters(effect, problem.survey, term.values or None, period)
+    for (name, parameter), value in (pinned or {}).items():
+        fixed[name] = {**fixed.get(name, {}), parameter: value}
+    free = [f for f in free if (f.effect, f.parameter.name) not in (pinned or {})]
     chain_names = list(names)
     if clock and not any(effect_named(n, problem.effects_directory).shifts_clock for n in names):
         (parameter,), believed = CLOCK.parameters, vehicle.command_delay

@@ -26,6 +26,9 @@ from trueflight.models.model import Model, Term
 MATERIAL_ACCELERATION = 0.02
 """m/s² RMS; smaller effects are within the bias stability of a MEMS accelerometer (2 mg)."""
 
+ADEQUATE = 1.25
+"""Times the noise up to which what is left may be noise alone: the noise is known to about a quarter."""
+
 
 @dataclass(frozen=True)
 class ForceProblem:
@@ -192,6 +195,12 @@ class ForceProblem:
         base = self.flights.predict([*rest, (effect, neutral)])
         moved = ({**neutral, p.name: p.typical} for p in sizes(effect))
         return np.column_stack([(self.flights.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
+
+    def adequate(self, here: Fit) -> bool:
+        """Whether no axis has much more left than its noise."""
+        noise = self.flights.measurements[0].noise[list(self.flights.measurements[0].axes)]
+        left = np.sqrt(np.mean(here.residual**2, axis=0))
+        return here.residual.shape[1] != len(noise) or bool(np.all(left < ADEQUATE * noise))
 
     def scale_of_thrust(self, here: Fit) -> tuple[tuple[str, ...], np.ndarray] | None:
         """The effects that scale the thrust as a whole, and what they change in the prediction (K A,)."""

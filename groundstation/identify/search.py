@@ -3,8 +3,10 @@
 Forward selection over the candidates with a backward check after every step. A candidate is screened by its
 linearisation at the current optimum; the best are fitted in full, given everything already in the model. It stays only
 if it is significant under autocorrelated residuals, matters in size, predicts held-out blocks better and has a
-physically plausible value. Where no candidate helps, one that was found may be exchanged for another. Afterwards every
-effect found is exchanged for each of its rivals: where the exchange costs nothing, the data cannot tell them apart.
+physically plausible value. Where no candidate helps, one that was found may be exchanged for another. Where more than
+noise is left then, the first step may have been wrong: the sets of two and three that are best by their linearisation
+are fitted, too. Afterwards every effect found is exchanged for each of its rivals: where the exchange costs nothing,
+the data cannot tell them apart, and no more where another set explains the flight nearly as well.
 
 What is measured, and how effects act on it, is a `Problem`: the specific force (`identify.translation`) or the angular
 acceleration (`identify.rotation`).
@@ -12,6 +14,7 @@ acceleration (`identify.rotation`).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -40,6 +43,8 @@ STRONG_EVIDENCE = 6.0
 LINEARISED = 2.0
 """Factor that the linearised gain of an effect is trusted to, before a full fit is saved by it."""
 MOST_EFFECTS = 6
+SETS = 3
+"""Sets of each size that are fitted in full where more than noise is left."""
 
 
 @dataclass(frozen=True, order=True)
@@ -111,6 +116,9 @@ class Problem(Measured, Protocol):
     def beside(self, here: Fit, choice: Choice) -> Fit | None:
         """The choice beside all that is fitted `here`, linearised; None where only a fit in full tells."""
 
+    def adequate(self, here: Fit) -> bool:
+        """Whether no more than noise is left."""
+
     def scale_of_thrust(self, here: Fit) -> tuple[tuple[str, ...], np.ndarray] | None:
         """The effects that scale the thrust as a whole, and what they change in the prediction (K A,); None where
         nothing does."""
@@ -171,6 +179,7 @@ class Search:
         self.problem, self.progress = problem, progress
         self.significance = FAMILY / max(1, len(problem.choices) if tried is None else tried)
         self._states: dict[frozenset[Choice], State] = {}
+        self._sets: dict[frozenset[Choice], tuple[State, ...]] = {}
 
     def state(self, choices: Sequence[Choice]) -> State:
         """The model with `choices`, all of them fitted."""
@@ -195,7 +204,10 @@ class Search:
                 break
             visited.add(frozenset(following.choices))
             current = following
-        return self._agreed_by_held_out(current)
+        for other in self._other_sets(current):
+            if self.evident(other, current) and other.cv_total < current.cv_total:
+                current = other
+        return self._agreed_by_held_out(self._backward(current))
 
     def settle(self, choices: Sequence[Choice]) -> State:
         """The fit of `choices`, without those that this flight does not support."""
@@ -229,9 +241,15 @@ class Search:
             if not all(self._shows(candidate, c) for c in step):
                 continue
             accepted += 1
-            if best is None or _score(candidate) < _score(best):
+            if best is None or self._better(candidate, best):
                 best = candidate
         return best
+
+    def _better(self, one: State, other: State) -> bool:
+        """Whether the evidence, or else the error on held-out blocks, speaks for `one`."""
+        if self.evident(one, other) or self.evident(other, one):
+            return self.evident(one, other)
+        return _score(one) < _score(other)
 
     def _exchange(self, current: State) -> State | None:
         """The best state with one effect exchanged for another that explains the flight evidently better."""
@@ -291,6 +309,74 @@ class Search:
             current = min(worse, key=lambda e: e[0])[1]
         return current
 
+    # --- other sets -----------------------------------------------------------------------------------------
+
+    def _other_sets(self, current: State) -> tuple[State, ...]:
+        """Sets of two and three effects that are best by their linearisation where nothing is in the model yet, fitted
+        in full; none where no more than noise is left."""
+        key = frozenset(current.choices)
+        if key not in self._sets:
+            found = () if self.problem.adequate(current.fit) else self._best_subsets(current)
+            self._sets[key] = tuple(
+                s
+                for s in map(self.state, found)
+                if all(plausible(s.fit, n) for n in s.names)
+                and all(s.fit.wald(n) < self.significance for n in s.names)
+            )
+        return self._sets[key]
+
+    def _best_subsets(self, current: State) -> list[tuple[Choice, ...]]:
+        start = self.state(self.problem.settled).fit
+        residual = start.residual.ravel()
+        unit = variance_per_independent_sample(self.problem, current.fit.residual)
+        columns = [start.jacobian.reshape(len(residual), -1)]
+        choices = [c for c in self.problem.choices if c not in self.problem.settled]
+        for choice in choices:
+            needed = self.problem.effects[choice.effect].acts_through
+            through = needed[0] if needed and not set(needed) & set(self.problem.included) else None
+            columns.append(self.problem.contribution(start, choice, through))
+        matrix = np.column_stack([*columns, residual])
+        gram = matrix.T @ matrix
+        edges = np.cumsum([c.shape[1] for c in columns])
+        own = {c: list(range(edges[i], edges[i + 1])) for i, c in enumerate(choices)}
+        base, found = list(range(edges[0])), []
+        for size in (2, 3):
+            scored = []
+            for chosen in itertools.combinations(choices, size):
+                present = {*self.problem.included, *(c.effect for c in chosen)}
+                once = len({c.effect for c in chosen}) == size
+                if not once or not all(self._acts(c, present) for c in chosen):
+                    continue
+                if set(current.choices) <= {*self.problem.settled, *chosen}:
+                    continue  # what goes beside all that is found has been tried
+                at = [*base, *(i for c in chosen for i in own[c])]
+                inner = gram[np.ix_(at, at)]
+                # the prior: columns are of a typical size, which it is two of wide
+                weight = np.where(np.arange(len(at)) < len(base), 1e-9 * np.diag(inner) + 1e-12, 0.25 * unit)
+                inner = inner + np.diag(weight)
+                left = gram[-1, -1] - gram[at, -1] @ np.linalg.solve(inner, gram[at, -1])
+                scored.append((left / unit + 2.0 * len(at), chosen))
+            scored.sort(key=lambda pair: pair[0])
+            found += [chosen for _, chosen in scored[:SETS]]
+        return [(*self.problem.settled, *chosen) for chosen in found]
+
+    def near(self, current: State) -> tuple[State, ...]:
+        """Other sets that explain the flight nearly as well, in units of what is left: they hold an effect that is not
+        found, and lack one that is."""
+        mine = set(current.names)
+
+        def as_good(other: State) -> bool:
+            unit = max(
+                variance_per_independent_sample(self.problem, s.fit.residual) for s in (current, other)
+            )
+            worse = (other.fit.sse - current.fit.sse) / unit
+            price = 2.0 * (len(other.fit.free) - len(current.fit.free))
+            return worse + other.fit.prior_penalty - current.fit.prior_penalty + price < STRONG_EVIDENCE
+
+        return tuple(
+            s for s in self._other_sets(current) if mine - set(s.names) and set(s.names) - mine and as_good(s)
+        )
+
     # --- rivals ---------------------------------------------------------------------------------------------
 
     def rivals(self, current: State, choice: Choice) -> tuple[str, ...]:
@@ -305,6 +391,9 @@ class Search:
             equal = evidence(self.problem, current.fit, other.fit) < STRONG_EVIDENCE
             if equal and self.evident(other, self.without(current, choice)):
                 found.append(rival.effect)
+        for other in self.near(current):
+            if choice.effect not in other.names:
+                found += [n for n in other.names if n not in {*current.names, *found}]
         return tuple(found)
 
     def _standing_in(self, current: State, choice: Choice) -> Iterator[Choice]:
@@ -326,7 +415,9 @@ class Search:
         without = self.without(current, choice)
         lost = without.fit.sse - current.fit.sse
         unit = variance_per_independent_sample(self.problem, current.fit.residual)
-        near = LINEARISED * self.problem.linearised_gain(without.fit, (rival,))
+        # with what acts only through it, and goes with it
+        gone = [c for c in current.choices if c != choice and c not in without.choices]
+        near = LINEARISED * self.problem.linearised_gain(without.fit, (rival, *gone))
         return near < lost and (lost - near) / unit > LINEARISED * STRONG_EVIDENCE
 
     # --- what is enough -------------------------------------------------------------------------------------

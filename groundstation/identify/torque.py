@@ -255,6 +255,10 @@ class TorqueProblem:
         """None: a fit in full takes no longer."""
         return None
 
+    def adequate(self, here: Fit) -> bool:
+        """True: with a handful of candidates, each step sees all there is."""
+        return True
+
     def scale_of_thrust(self, here: Fit) -> None:
         """None: a gain about each axis is fitted beside every effect."""
 

@@ -22,6 +22,7 @@ from trueflight.groundstation.identify.fitting import (
 from trueflight.groundstation.identify.force import ForceProblem, mean_square_before
 from trueflight.groundstation.identify.rates import judge_rates
 from trueflight.groundstation.identify.remainder import unexplained
+from trueflight.groundstation.identify.ridges import ridges, with_ridges
 from trueflight.groundstation.identify.rotation import RotationalFindings, judge_rotation
 from trueflight.groundstation.identify.rotors import MeasuredRotors, has_rotor_speeds
 from trueflight.groundstation.identify.search import Search, State
@@ -158,6 +159,7 @@ def _report(search: Search, found: State, everything: Search, rotation: Rotation
         unexplained=remains,
         left_out=m.left_out,
         rotational=rotation.rms,
+        alternatives=tuple(s.names for s in search.near(found)),
     )
 
 
@@ -181,6 +183,7 @@ def _verdicts(
         before * problem.samples, lambda share: f": {np.sqrt(max(share, 0.0) * before):.3f} m/s² RMS"
     )
     named, absent = judge(search, found, here, scale, lambda name: _seen_as(problem, name, here), doubt)
+    named = with_ridges(named, ridges(entire, here, found.names))
     candidates = {c.effect for c in problem.choices}
     others = [
         unmeasured(e, e.lacks(problem.flight))

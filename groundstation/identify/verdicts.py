@@ -53,7 +53,7 @@ def judge(
     for rank, (share, choice) in enumerate(ranked, 1):
         effect, same = search.problem.effects[choice.effect], rivals[choice]
         weighed = None if doubt is None else doubt.of(effect.name)
-        sure = not same and (weighed is None or weighed.holds)
+        sure = not same and (weighed is None or weighed.holds) and _somewhere(figures, effect.name)
         found.append(
             EffectVerdict(
                 effect.name,
@@ -71,6 +71,14 @@ def judge(
     absent = dict.fromkeys(c.effect for c in search.problem.choices if c.effect not in current.names)
     stood_for = {n: [c.effect for c, same in rivals.items() if n in same] for n in absent}
     return found, [_absent(search, current, scale, n, stood_for[n]) for n in absent]
+
+
+def _somewhere(figures: Fit, name: str) -> bool:
+    """Whether the interval of one parameter excludes "no effect": several may be significant together alone."""
+    own = figures.sizes(name)
+    return not own or any(
+        not figures.interval(i)[0] <= figures.free[i].neutral <= figures.interval(i)[1] for i in own
+    )
 
 
 def _absent(
@@ -96,7 +104,8 @@ def _absent(
 
     if stands_for:
         # as a stand-in for the effect found, not beside it
-        swapped = [
+        whole_sets = [s.fit for s in search.near(current) if name in s.names and stands_for[0] not in s.names]
+        swapped = whole_sets or [
             search.state([c if n.effect == stands_for[0] else n for n in current.choices]).fit for c in own
         ]
         return verdict(POSSIBLE, min(swapped, key=lambda f: f.sse), stands_for, _tell(stands_for, effect))

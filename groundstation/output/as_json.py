@@ -81,9 +81,15 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
                 "advice": e.advice,
                 "seen_in": e.seen_in,
                 "rests_on": e.rests_on,
+                "undetermined": list(e.undetermined),
+                "products": {
+                    p.name: {"value": p.value, "low": p.low, "high": p.high, "unit": p.unit}
+                    for p in e.products
+                },
             }
             for e in d.effects
         ],
+        "alternatives": [list(names) for names in d.alternatives],
         "unexplained": asdict(d.unexplained),
         "nuisance": {"clock_shift": {"value": d.clock_shift, "unit": "s"}},
         "left_out": d.left_out,

@@ -129,6 +129,8 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
             f"angular acceleration {r.before:.3f} -> {r.after:.3f} rad/s² (noise floor {r.noise_floor:.3f})",
             highlight=False,
         )
+    for names in d.alternatives:
+        console.print(f"As well explained by {' with '.join(names)}", style="yellow", highlight=False)
     if d.unexplained.verdict:
         console.print(
             f"Unexplained: {percent(d.unexplained.variance_share)} of what is left is more than noise and fits no "
@@ -150,9 +152,14 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
 
 
 def _parameters(e: EffectVerdict) -> str:
-    return "\n".join(
-        f"{p.name} = {p.value:.3g} {_unit(p.unit)}  [{p.low:.3g}, {p.high:.3g}]" for p in e.parameters
-    )
+    told = [
+        f"{p.name} not determined"
+        if p.name in e.undetermined
+        else f"{p.name} = {p.value:.3g} {_unit(p.unit)}  [{p.low:.3g}, {p.high:.3g}]"
+        for p in e.parameters
+    ]
+    told += [f"{p.name} = {p.value:.3g}  [{p.low:.3g}, {p.high:.3g}]" for p in e.products]
+    return "\n".join(told)
 
 
 def _unit(unit: str) -> str:

@@ -12,7 +12,7 @@ from trueflight.models.trajectory import Trajectory
 from trueflight.models.vehicle import load_vehicle
 from trueflight.sim_bridge.in_process import record
 from trueflight.sim_bridge.plan import Plan
-from trueflight.sim_bridge.truth.hidden import choose
+from trueflight.sim_bridge.truth.hidden import Hidden, choose
 from trueflight.sim_bridge.truth.sensors import Noise
 
 VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
@@ -20,9 +20,14 @@ VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle
 
 def fly(path: Path, hidden: tuple[str, ...], seed: int, flown: Trajectory) -> None:
     """Fly into the record `path`, with the sensors' noise."""
+    fly_with(path, choose(list(hidden), load_vehicle(VEHICLE), seed), seed, flown)
+
+
+def fly_with(path: Path, hidden: tuple[Hidden, ...], seed: int, flown: Trajectory) -> None:
+    """Fly into the record `path` with effects of given numbers."""
     vehicle = load_vehicle(VEHICLE)
     design = load_design(VEHICLE.with_name("design.json"), vehicle)
-    record(Plan(vehicle, design, flown, choose(list(hidden), vehicle, seed), seed, noise=Noise()), path)
+    record(Plan(vehicle, design, flown, hidden, seed, noise=Noise()), path)
 
 
 @cache

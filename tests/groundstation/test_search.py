@@ -81,6 +81,12 @@ class Columns:
         residual = here.residual.ravel()
         return float(residual @ matrix @ np.linalg.lstsq(matrix, residual, rcond=None)[0])
 
+    def adequate(self, here: Fit) -> bool:
+        return False
+
+    def scale_of_thrust(self, here: Fit) -> None:
+        return None
+
     def beside(self, here: Fit, choice: Choice) -> Fit | None:
         return None
 
