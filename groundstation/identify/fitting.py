@@ -265,8 +265,8 @@ def fit(
         effect = effect_named(term.effect, problem.effects_directory)
         if (refit is None or term.effect in refit) and not effect.rotational:
             free += free_parameters(effect, problem.survey, term.values or None, period)
-    for (name, parameter), value in (pinned or {}).items():
-        fixed[name] = {**fixed.get(name, {}), parameter: value}
+    for (name, held), value in (pinned or {}).items():
+        fixed[name] = {**fixed.get(name, {}), held: value}
     free = [f for f in free if (f.effect, f.parameter.name) not in (pinned or {})]
     chain_names = list(names)
     if clock and not any(effect_named(n, problem.effects_directory).shifts_clock for n in names):
