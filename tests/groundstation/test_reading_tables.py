@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from trueflight.groundstation.reading import read_flight, segments
 from trueflight.groundstation.reading.mapping import UNITS
 from trueflight.groundstation.reading.writing import own_table, write_flight
+from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS
 from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, rotate, rotate_inverse
 from trueflight.models.vehicle import GRAVITY, load_vehicle
@@ -290,3 +291,41 @@ def test_gravity_stays_in_the_specific_force_of_a_world_acceleration():
     level = rotate_inverse(flight.quaternion, np.array([0.0, 0.0, GRAVITY]))
     resting = (flight.t > 13.0) & (flight.t < 15.0)
     assert np.abs(flight.specific_force[resting] - level[resting]).max() < 0.3
+
+
+def jittered(t):
+    return t + np.random.default_rng(1).uniform(-0.003, 0.003, len(t))
+
+
+@pytest.mark.parametrize(
+    ("every", "clock", "rate"),
+    [
+        (4, lambda t: t, 25),
+        (1, jittered, 100),
+        (1, lambda t: t + 1.78e9, 100),
+        (4, lambda t: jittered(t) + 1.78e9, 25),
+    ],
+    ids=["25 Hz", "jitter", "since 1970", "all of it"],
+)
+def test_slow_uneven_and_epoch_clocks_make_the_same_flight(flight, every, clock, rate, tmp_path):
+    t = clock(flight.t)
+    columns = own_table(flight) | {"t": t}
+    for name in columns.keys() - {"t", "flying"}:  # what was measured at the uneven times
+        columns[name] = np.interp(t - t[0] + flight.t[0], flight.t, columns[name])
+    path = tmp_path / "flight.csv"
+    table = np.column_stack(list(columns.values()))[::every]
+    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.6f")
+    again = read_flight(path, flight.vehicle)
+    assert 1 / again.dt == pytest.approx(rate, rel=0.05)
+    assert not {c.verdict for c in again.consistency} & {"weak", "contradicts", "undone"}
+    at = again.t - again.t[0] + flight.t[0]
+    for name, tolerance in (("position", 0.03), ("velocity", 0.1)):
+        wanted = np.stack([np.interp(at, flight.t, c) for c in getattr(flight, name).T], -1)
+        assert np.abs(getattr(again, name) - wanted).max() < tolerance, name
+
+
+def test_a_table_in_which_the_logger_began_again_is_refused(flight, tmp_path):
+    columns = own_table(flight.part(slice(0, 1000)))
+    twice = {name: np.concatenate([column, column]) for name, column in columns.items()}
+    with pytest.raises(InputError, match="split the file where the logger started again"):
+        read_flight(write(tmp_path / "flight.csv", twice), flight.vehicle)
