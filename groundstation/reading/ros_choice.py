@@ -74,13 +74,16 @@ def choose(origin: str, sources: Sequence[Source], wanted: Sources) -> Chosen:
     others = [v for v in vehicles if v != vehicle]
     notes = [f"{quantity} is from {name}, as chosen" for quantity, name in wanted.topics]
     if others:
-        listed = ", ".join(v or "/" for v in others[:4])
+        listed = f" (there are {', '.join(v or '/' for v in others[:4])})" if others[1:] else ""
         notes.append(
             f"{len(vehicles)} vehicles in the recording: that of namespace {vehicle or '/'} is read, and nothing of "
-            f"the others'; --vehicle-namespace {others[0] or '/'} reads another (there are {listed})"
+            f"the others'; --vehicle-namespace {others[0] or '/'} reads another{listed}"
         )
     all_of = set(vehicles) | {vehicle}
     owned = {s.topic: owner(s, vehicle, all_of) for s in sources}
+    strange = [s.topic for s in sources if owned[s.topic] not in (None, *all_of)]
+    if strange:
+        notes.append(f"{', '.join(strange[:4])} left out: named as another vehicle's than {vehicle}")
     mine = {s.topic for s in sources if owned[s.topic] == vehicle}
     near = [s for s in sources if owned[s.topic] in (vehicle, None)]
     ros = [s for s in near if not s.px4]
@@ -144,6 +147,17 @@ class _StandIns:
     def add(self, sources: Sequence[Source], asked: dict[str, Part]) -> None:
         """Choose among `sources` for everything that was not `asked` for from elsewhere."""
         estimated = {"vehicle_local_position", "vehicle_odometry"} & set(self.parts)
+        for kind, own in (
+            (POSE, estimated),
+            (IMU, {IMU.part} & set(self.parts)),
+            (BATTERY, {BATTERY.part} & set(self.parts)),
+        ):
+            left = [s.topic for s in sources if kind.part in s.parts]
+            if own and left and kind.quantity not in asked:
+                self.notes.append(
+                    f"of the {kind.words} in the recording PX4's own is read; --topic {kind.quantity}={left[0]} "
+                    "reads another"
+                )
         self._motion(
             [] if estimated or "position" in asked else [s for s in sources if POSE.part in s.parts],
             [

@@ -76,6 +76,17 @@ def test_another_vehicles_imu_stands_in_for_nothing(tmp_path: Path) -> None:
     assert "vehicle_attitude" in log.topics and "sensor_combined" not in log.topics
 
 
+def test_without_a_bridge_names_tell_vehicles_apart(tmp_path: Path) -> None:
+    bag = Bag(tmp_path / "bag.mcap")
+    for space, one, every in (("cf1", flown(), 2), ("cf2", stranger(), 1)):
+        poses(bag, f"/vrpn/{space}/pose", one, every)
+        imu(bag, f"/{space}/imu", one, every)
+    thrust(bag, "/cf1/cmd_attitude", flown())
+    log = load_ros_bag(bag.save())
+    assert is_pose(log, flown())
+    assert any("/cf2/imu" in note and "left out" in note for note in log.notes)
+
+
 def mocap(path: Path, other: Flown, imus: bool = True) -> Path:
     bag = Bag(path)
     poses(bag, "/vrpn_mocap/drone/pose", flown())
