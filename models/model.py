@@ -20,7 +20,7 @@ _RESTORE = "restore it from a copy"
 
 
 class Unfinished(InputError):
-    """A model version whose writer was killed: no version at all, and never one."""
+    """A file that a killed writer left in the place of a model version: it is not a version and never becomes one."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Model:
 
     `terms` in the order in which they were added; `parent` is the version it was made from; `data_hash` the SHA-256
     of the data that its effects were fitted to; `fit` holds the figures of that fit (residual RMS, m/s²). `network`
-    is what was learnt of the remainder that these very effects leave.
+    was trained on what exactly these effects leave unexplained.
     """
 
     vehicle: Vehicle

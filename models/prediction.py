@@ -97,8 +97,8 @@ def rotor_thrust(flight: Flight) -> np.ndarray | None:
 
 
 def motion_of_features(columns: Mapping[str, Array], vehicle: Vehicle) -> Motion:
-    """The features (28) of `models.contract`, `columns` each (N,), of a `vehicle` as effects see them: no history, so
-    no delay and no lag."""
+    """The motion that effects see, from the features (28) of `models.contract`: `columns` (N,) by name, of a
+    `vehicle`. Features have no history, so there is no delay and no lag."""
     thrust = columns["T"] / vehicle.mass
     xp = array_namespace(thrust)
     zero, one = 0.0 * thrust, 0.0 * thrust + 1.0
@@ -178,7 +178,8 @@ def linear_thrust(motion: Motion) -> Array:
 def rotor_torque(motion: Motion) -> Array:
     """Torque (N, 3) of the rotors' thrusts about the believed centre of mass, body axes, N m.
 
-    About z it is the drag torque of the rotors over the length that relates it to thrust, which no vehicle file tells.
+    About z it is the drag torque of the rotors divided by the length that relates it to thrust, which no vehicle file
+    tells.
     """
     xp = array_namespace(motion.rotor_thrust)
     roll = pitch = yaw = 0.0 * motion.rotor_thrust[:, 0]

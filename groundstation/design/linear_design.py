@@ -62,17 +62,7 @@ def make_design(
     """
     import control
 
-    for name, value in (("bandwidth", bandwidth), ("attitude bandwidth", attitude_bandwidth)):
-        if not 0.01 <= value <= 20.0:
-            raise InputError(
-                f"design: {name} {value:g} Hz is outside 0.01 to 20 Hz; choose one that a vehicle can fly"
-            )
-    if attitude_bandwidth < SEPARATION * bandwidth:
-        raise InputError(
-            f"design: attitude bandwidth {attitude_bandwidth:g} Hz is less than {SEPARATION:g} times the "
-            "position "
-            f"bandwidth {bandwidth:g} Hz; raise --attitude-bandwidth or lower --bandwidth"
-        )
+    _check_bandwidths(bandwidth, attitude_bandwidth)
     turn = 2 * math.pi * attitude_bandwidth
     q_zeta = np.diag([TILT_ERROR**-2.0] * 2 + [TILT_ERROR**-2.0])
     r_zeta = np.diag([(TILT_ERROR * turn) ** -2.0] * 2 + [(TILT_ERROR * turn * YAW_RATIO) ** -2.0])
@@ -102,16 +92,34 @@ def make_design(
         rate=rate,
         created_by=f"groundstation design, {bandwidth:g} Hz position, {attitude_bandwidth:g} Hz attitude",
     )
+    _check_margins(design, vehicle)
+    return design
+
+
+def _check_bandwidths(position: float, attitude: float) -> None:
+    """Raise `InputError` for bandwidths (Hz) that no vehicle flies, or that lie too close together."""
+    for name, value in (("bandwidth", position), ("attitude bandwidth", attitude)):
+        if not 0.01 <= value <= 20.0:
+            raise InputError(
+                f"design: {name} {value:g} Hz is outside 0.01 to 20 Hz; choose one that a vehicle can fly"
+            )
+    if attitude < SEPARATION * position:
+        raise InputError(
+            f"design: attitude bandwidth {attitude:g} Hz is less than {SEPARATION:g} times the position "
+            f"bandwidth {position:g} Hz; raise --attitude-bandwidth or lower --bandwidth"
+        )
+
+
+def _check_margins(design: Design, vehicle: Vehicle) -> None:
+    """Raise `InputError` where the vehicle's delay and lag leave a loop too little phase."""
     for loop in loops(design, vehicle):
         if loop.phase_margin < PHASE_MARGIN:
-            delay, lag = actuation(vehicle, rate)
+            delay, lag = actuation(vehicle, design.rate)
             raise InputError(
-                f"design: the {loop.name} loop keeps only {loop.phase_margin:.0f} degrees of phase margin "
-                "with "
+                f"design: the {loop.name} loop keeps only {loop.phase_margin:.0f} degrees of phase margin with "
                 f"{1e3 * delay:.0f} ms delay and {1e3 * lag:.0f} ms lag of '{vehicle.name}' (at least "
                 f"{PHASE_MARGIN:.0f}); lower --attitude-bandwidth and --bandwidth"
             )
-    return design
 
 
 def translation(mass: float) -> tuple[np.ndarray, np.ndarray]:

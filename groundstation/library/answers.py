@@ -77,7 +77,7 @@ class WhereItFails(results.WhereItFails):
 @dataclass(frozen=True, repr=False)
 class Comparison(results.Comparison):
     """One model against one flight of N samples, heading frame: `measured`, `predicted` and `residual` (N, 3) are
-    accelerations in m/s² behind the same low-pass of `bandwidth` Hz; `used` (N,) marks the samples that count.
+    accelerations in m/s² after the same low-pass of `bandwidth` Hz; `used` (N,) marks the samples that count.
 
     `rms` and `noise_floor` are over all axes, m/s²; `label` names the model, `axes` has the errors one by one,
     `horizons` the open-loop errors (m, m/s).
@@ -187,9 +187,9 @@ class Diagnosis(results.Diagnosis):
     """Which effects `base` lacks on a flight: `effects` with verdict, parameters and 95 % intervals, ranked.
 
     `model` is `base` with every effect found. `rms_before`, `rms_after` and `noise_floor` are over all axes in m/s²,
-    behind `bandwidth` Hz; `validation_before` and `validation_after` the same on the flight held out (`held_out`).
-    `line` are the models that led to `base`, `asked_bandwidth` the Hz that were asked for (None: what the flight
-    resolves).
+    after a low-pass of `bandwidth` Hz; `validation_before` and `validation_after` the same on the flight held out
+    (`held_out`). `line` holds the models that led to `base`, `asked_bandwidth` is the bandwidth that was asked for,
+    Hz (None: chosen from the flight).
     """
 
     held_out: Flight | None = None
@@ -224,7 +224,8 @@ class Diagnosis(results.Diagnosis):
 
     @property
     def pvalues(self) -> dict[str, float]:
-        """Of every effect that was judged: how probable as much is without it, robust to correlated residuals."""
+        """The p-value of every effect that was judged: how probable an improvement as large would be without the
+        effect. It allows for correlated residuals."""
         return {e.name: e.p_value for e in self.effects}
 
     def conf_int(self) -> dict[str, tuple[float, float]]:
@@ -262,8 +263,8 @@ class Diagnosis(results.Diagnosis):
         return data_frame({name: [row[k] for row in rows] for k, name in enumerate(names)}, index=names[:2])
 
     def to_dict(self) -> dict[str, Any]:
-        """What `groundstation diagnose --json` prints, in the units that it names: the diagnosis and its `analysis`,
-        with the design that the flight's record carries, where it does."""
+        """The diagnosis and its `analysis`, as `groundstation diagnose --json` prints them, in the units named there.
+        The design is that of the flight's record, where it carries one."""
         from trueflight.groundstation.output.as_json import analysis_table
         from trueflight.groundstation.versions.choice import choose_design
 

@@ -104,7 +104,7 @@ def read_all(
     vehicle: str | Path | Vehicle | None = None,
     mapping: Given = None,
 ) -> list[Flight]:
-    """Read several flights: of `paths` the files, and every flight of folders, in the order of their names.
+    """Read several flights: the files among `paths`, and every flight in the folders among them, ordered by name.
 
     `vehicle` and `mapping` as for `read`, for all of them; columns in SI units. Raises `InputError` as `read` does, and
     for a folder without flights.

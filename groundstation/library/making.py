@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Training:
-    """A network that was trained on what a model leaves over: `model` is that model with it, `history` every epoch
-    (RMS per axis in m/s²), `before` and `after` the RMS (m/s²) of the remainder on the blocks held out.
+    """A network that was trained on what a model leaves unexplained: `model` is that model together with the network,
+    `history` has every epoch (RMS per axis in m/s²), `before` and `after` are the RMS (m/s²) of what is unexplained
+    on the blocks held out.
 
     `seconds` is the flight time that it was trained and checked on; `noise_floor` (m/s²) what sensor noise leaves.
     """
@@ -98,11 +99,12 @@ def train(
     store: str | Path = DEFAULT_STORE,
     effects: str | Path | None = None,
 ) -> Training:
-    """Train a network on what a model does not explain of `flights`, two thirds of them in blocks; not saved.
+    """Train a network on what a model does not explain of `flights`: on two thirds of them, cut into blocks; not
+    saved.
 
     `model`, `bandwidth` (Hz), `store` and `effects` as for `compare`. `layers` are the widths of the hidden layers,
-    `recipe` is "default" or "paper" (Carvalho et al. 2022, section V), `epochs` at most so many (None: the recipe's),
-    `seed` draws the split, the first weights and the batches.
+    `recipe` is "default" or "paper" (Carvalho et al. 2022, section V), `epochs` the most that it may take (None: the
+    recipe's), `seed` draws the split, the first weights and the batches.
 
     Raises `InputError` where flights lack columns or are too short, and for impossible layers.
     """
@@ -130,8 +132,9 @@ def export(
 ) -> Path:
     """Write a `model` to `output` as one ONNX file with its contract, ready to deploy.
 
-    `flights` give the range it was trained in, its golden vectors and what they show of the rate loop (s). Returns the
-    path. Raises `InputError` for a flight of another vehicle, and where the file cannot be written.
+    From the `flights` come the range in which it may be trusted, the examples that the companion checks it by, and
+    the delay and lag (s) of the rate loop. Returns the path. Raises `InputError` for a flight of another vehicle, and
+    where the file cannot be written.
     """
     from trueflight.groundstation.identify.actuation import actuation_of
     from trueflight.models.export import export_onnx
@@ -190,10 +193,10 @@ def simulate(
     """Fly in the simulator, by the companion's own control law, and read the record that it writes to `output` (.mcap).
 
     `trajectory` with its `parameters` (SI units) is one of `groundstation trajectories`, or a CSV file of setpoints.
-    `vehicle` is the vehicle.toml of what its owner believes, `hidden` what the simulated vehicle has beside it: NAME,
-    NAME:SIZE, "random" (drawn by `seed`; `reveal` tells), "rich". `correction` is an ONNX file, `controller` lqr,
-    lqr_integral or corrected (by default corrected where there is a correction), `design` the gains, or their file
-    (None: that beside the vehicle). `noise` is a factor on that of the sensors.
+    `vehicle` is the vehicle.toml of what its owner believes, `hidden` what the simulated vehicle has in addition:
+    NAME, NAME:SIZE, "random" (drawn by `seed`; `reveal` tells), "rich". `correction` is an ONNX file, `controller`
+    lqr, lqr_integral or corrected (by default corrected where there is a correction), `design` the gains, or their
+    file (None: that beside the vehicle). `noise` is a factor on the noise of the sensors (0: none).
 
     It runs `sim-bridge`, the program, and so needs it installed. Raises `InputError` for whatever that refuses.
     """
@@ -217,7 +220,7 @@ def simulate(
 
 
 def reveal(flight: columns.Flight) -> dict[str, dict[str, float]]:
-    """What was hidden at random in a simulated `flight`: values by parameter, by effect, in SI units.
+    """What was hidden at random in a simulated `flight`: for each effect its values by parameter, in SI units.
 
     Raises `InputError` where there is no sealed answer beside its record.
     """

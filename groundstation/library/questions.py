@@ -43,9 +43,10 @@ def compare(
     """The acceleration that a model predicts, against the measured one: residual, noise floor, open-loop error.
 
     `flight` has N samples. `model` is a model itself, its number in `store` (a folder of versions), its file, or
-    "linear" for the hover linearisation alone; None is the newest version, and where there is none exact rotation.
-    `bandwidth` is that of the low-pass on both sides, Hz (None: what the flight resolves). `effects` is a folder of
-    your own effects. Accelerations (N, 3) come back in m/s², heading frame.
+    "linear" for the hover linearisation alone; None takes the newest version or, where there is none, the hover
+    linearisation with exact rotation. `bandwidth` is that of the low-pass on both accelerations, Hz (None: chosen
+    from the flight). `effects` is a folder of your own effects. Accelerations (N, 3) come back in m/s², heading
+    frame.
 
     Raises `InputError` where the flight lacks what a comparison needs, and for a model of another vehicle.
     """
@@ -65,8 +66,8 @@ def side_by_side(
 ) -> SideBySide:
     """Several `flights`, each with each of `models`, over the same bins: errors in m/s², heading frame.
 
-    `models` as `model` of `compare`; `bandwidth` (Hz), `store` and `effects` as there. Raises `InputError` as `compare`
-    does.
+    Each of `models` is what `compare` takes as `model`; `bandwidth` (Hz), `store` and `effects` as for `compare`.
+    Raises `InputError` as `compare` does.
     """
     from trueflight.groundstation.evaluate.side_by_side import side_by_side
     from trueflight.groundstation.library.answers import SideBySide
@@ -103,8 +104,8 @@ def diagnose(
     """Which effect is missing from a model: ranked, with parameters and 95 % intervals, checked on held-out data.
 
     `flight` is what effects are fitted to, `validate` another flight of the same vehicle, held out of every fit.
-    `model`, `bandwidth` (Hz), `store` and `effects` as for `compare`, with exact rotation in any case. Errors come back
-    in m/s²; docs/diagnosis.md tells how verdicts are reached.
+    `model`, `bandwidth` (Hz), `store` and `effects` as for `compare`; exact rotation is always part of the model.
+    Errors come back in m/s²; docs/diagnosis.md tells how verdicts are reached.
 
     Raises `InputError` where a flight lacks what a comparison needs or is too short, and for a model of another
     vehicle.
@@ -154,7 +155,7 @@ def track(flight: Flight, *, design: Design | str | Path | None = None) -> Track
 
     `design` holds the gains, or is their file; None takes those that the flight's record carries.
 
-    Raises `InputError` where there is no design, where references or states are missing, or nothing lasts long enough.
+    Raises `InputError` where there is no design, where references or states are missing, or no stretch is long enough.
     """
     from trueflight.groundstation.evaluate.tracking import track
     from trueflight.groundstation.library.answers import Tracking
@@ -171,8 +172,9 @@ def bound(
 ) -> Tube:
     """The tube that the stability bound predicts for a `flight`, and whether it stayed inside (m, m/s, world ENU).
 
-    `design` as for `track`. `earlier` is the flight that tells the bound on disturbances; None takes the flight itself.
-    The tube stands `around` the linear design's own flight ("design") or the "reference". docs/control.md derives it.
+    `design` as for `track`. The bound on disturbances is taken from the flight `earlier`, with None from this flight
+    itself. The tube lies `around` the flight of the linear design ("design") or around the "reference".
+    docs/control.md derives it.
 
     Raises `InputError` where a flight lacks what this needs.
     """

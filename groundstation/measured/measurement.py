@@ -142,16 +142,7 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
             f"{flight.origin or flight.name}: {flight.duration:.1f} s of flight are too short; give "
             f"{SHORTEST:g} s or more"
         )
-    if flight.specific_force is not None:
-        raw, differentiate, default = flight.specific_force, False, ACCELEROMETER_BANDWIDTH
-    elif flight.velocity is not None and flight.quaternion is not None:
-        raw, differentiate, default = flight.velocity, True, DIFFERENTIATED_BANDWIDTH
-    else:
-        raise InputError(
-            f"{flight.origin or flight.name}: neither an accelerometer nor velocity and attitude; add "
-            "specific_force_x, _y, _z "
-            "or velocity_* and quaternion_* (map yours with --mapping)"
-        )
+    raw, differentiate, default = _sensed(flight)
     bandwidth = min(bandwidth or default, 0.4 * min(fs, flight.sensor_rate or fs))
     sos = signal.butter(4, bandwidth, fs=fs, output="sos")
     step = max(1, int(fs / (2.5 * bandwidth))) if thin else 1
@@ -204,6 +195,18 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
         noise=noise,
         axes=(0, 1, 2) if flight.quaternion is not None else (2,),
         left_out=left_out,
+    )
+
+
+def _sensed(flight: Flight) -> tuple[np.ndarray, bool, float]:
+    """The column (N, 3) that tells the acceleration, whether it is a velocity, and the usual bandwidth of it, Hz."""
+    if flight.specific_force is not None:
+        return flight.specific_force, False, ACCELEROMETER_BANDWIDTH
+    if flight.velocity is not None and flight.quaternion is not None:
+        return flight.velocity, True, DIFFERENTIATED_BANDWIDTH
+    raise InputError(
+        f"{flight.origin or flight.name}: neither an accelerometer nor velocity and attitude; add "
+        "specific_force_x, _y, _z or velocity_* and quaternion_* (map yours with --mapping)"
     )
 
 

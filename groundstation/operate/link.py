@@ -62,19 +62,13 @@ class Link:
         self.settings = settings
         self._subscribers: list[Any] = []
         self.keys = read_keys(settings.keys) if settings.keys else None
-        self.session, self._where, self.exposed = _open(settings, self.keys)
+        self.session, where, self.exposed = _open(settings, self.keys)
         try:
-            self.vehicle, self.instance, access = self._find(settings.name)
+            self.vehicle, self.instance, access = _find(self.session, settings, self.keys, where)
         except InputError:
             self.session.close()
             raise
-        ways = [f"it {way}" for way in _words(access, "exposed")] + [
-            f"this end {way}" for way in self.exposed
-        ]
-        loose = access.get("loose") if isinstance(access.get("loose"), str) else ""
-        self.warning = (
-            f"insecure, anybody on the network can fly it: {', '.join(ways)}" if ways else str(loose or "")
-        )
+        self.warning = _warning(access, self.exposed)
         """What is open to anybody, in words; '' where nothing is."""
 
     def __enter__(self) -> Link:
@@ -247,31 +241,6 @@ class Link:
             )
         )
 
-    def _find(self, name: str) -> tuple[str, str, dict[str, Any]]:
-        """Name and identity of the vehicle that is meant, and what it says of who may reach it."""
-        end = time.monotonic() + self.settings.timeout
-        while True:
-            there = _answers(self.session, name or "*", min(_LOOK, self.settings.timeout))
-            names = sorted({one.vehicle for one in there})
-            if len(names) > 1:
-                raise InputError(
-                    f"{len(names)} companions answer ({', '.join(names)}); choose one with --name"
-                )
-            if len(there) > 1:
-                raise InputError(_several(self.session, names[0], there))
-            if there:
-                access = there[0].status.get("access")
-                return there[0].vehicle, there[0].instance, access if isinstance(access, dict) else {}
-            if time.monotonic() > end:
-                break
-            time.sleep(0.05)
-        what = f"companion '{name}'" if name else "companion"
-        names = sorted({one.vehicle for one in _answers(self.session, "*", _LOOK)})
-        others = f"; there are: {', '.join(names)}" if names else "; is it running, and listening there?"
-        if self.keys is not None and not names:
-            others = f"; is '{self.keys.certificate}' on its list (access.toml in the vehicle's keys)?"
-        raise InputError(f"no {what} answers on {self._where}{others} (other endpoint: -e tcp/HOST:PORT)")
-
     def _signed(self, onnx: bytes) -> bytes | None:
         """The signature that goes with a model; None without an engineer's keys."""
         if self.keys is None or not self.keys.path(SIGNING_KEY).exists():
@@ -378,6 +347,41 @@ def _answer(reply: zenoh.Reply) -> Answer | None:
     if len(parts) != 3 or not isinstance(status, dict) or "accepted" not in status:
         return None
     return Answer(parts[1], _instance(reply), status)
+
+
+def _find(
+    session: zenoh.Session, settings: Settings, keys: Keys | None, where: str
+) -> tuple[str, str, dict[str, Any]]:
+    """Name and identity of the vehicle that is meant, and what it says of who may reach it."""
+    name = settings.name
+    end = time.monotonic() + settings.timeout
+    while True:
+        there = _answers(session, name or "*", min(_LOOK, settings.timeout))
+        names = sorted({one.vehicle for one in there})
+        if len(names) > 1:
+            raise InputError(f"{len(names)} companions answer ({', '.join(names)}); choose one with --name")
+        if len(there) > 1:
+            raise InputError(_several(session, names[0], there))
+        if there:
+            access = there[0].status.get("access")
+            return there[0].vehicle, there[0].instance, access if isinstance(access, dict) else {}
+        if time.monotonic() > end:
+            break
+        time.sleep(0.05)
+    what = f"companion '{name}'" if name else "companion"
+    names = sorted({one.vehicle for one in _answers(session, "*", _LOOK)})
+    others = f"; there are: {', '.join(names)}" if names else "; is it running, and listening there?"
+    if keys is not None and not names:
+        others = f"; is '{keys.certificate}' on its list (access.toml in the vehicle's keys)?"
+    raise InputError(f"no {what} answers on {where}{others} (other endpoint: -e tcp/HOST:PORT)")
+
+
+def _warning(access: dict[str, Any], exposed: Sequence[str]) -> str:
+    """What is open to anybody, at the companion's end or at this one, in words; '' where nothing is."""
+    ways = [f"it {way}" for way in _words(access, "exposed")] + [f"this end {way}" for way in exposed]
+    if ways:
+        return f"insecure, anybody on the network can fly it: {', '.join(ways)}"
+    return access["loose"] if isinstance(access.get("loose"), str) else ""
 
 
 def _words(table: dict[str, Any], key: str) -> list[str]:
