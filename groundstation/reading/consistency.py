@@ -18,7 +18,6 @@ from trueflight.groundstation.reading.breaks import Step, steps, told, without
 from trueflight.groundstation.reading.faults import (
     Columns,
     Fault,
-    about_z,
     single_faults,
     turn_between,
     turned,
@@ -256,7 +255,7 @@ def _turns(windows: Windows, columns: Columns) -> Iterator[Fault]:
     pairs = {p.name: p for p in windows.pairs(columns) if len(p.one)}
     path = pairs.get(FORCE) or pairs.get(TILT)
     if path is not None:
-        angle, names = turn_between(path.other, path.one), _trajectory(columns)
+        angle, names = path.turn(), _trajectory(columns)
         cause = f"the frame of {' and '.join(names)} is turned by {{}} about z against that of the attitude"
         yield turned(cause, angle, names, 1)
     for names, cause in (
@@ -325,13 +324,13 @@ def _delay(windows: Windows, columns: Columns, name: str) -> tuple[float, float,
     here = windows.pair(name, columns, 0, reach)
 
     def left_at(shifts: np.ndarray) -> np.ndarray:
-        return np.array([windows.later(here, columns, int(shift), reach).left_but_drag for shift in shifts])
+        return np.array([windows.later(here, columns, int(shift), reach).left for shift in shifts])
 
     rough = np.arange(-reach, reach + 1, coarse)
     about = left_at(rough)
     near = int(rough[np.argmin(about)])
     shifts = np.arange(max(near - coarse, -reach), min(near + coarse, reach) + 1, step)
-    left, now = left_at(shifts), here.left_but_drag
+    left, now = left_at(shifts), here.left
     best = int(np.argmin(left))
     possible = [abs(k) for k, some in zip(rough, about, strict=True) if here.gained(some, left[best]) < SURE]
     unsure = float(max(possible, default=0) * windows.dt)
@@ -351,18 +350,12 @@ def _small_turns(columns: Columns, moving: list[Pair]) -> Iterator[Check]:
             continue
         names: tuple[str, ...] = _trajectory(columns)
         cause = f"the frame of {' and '.join(names)} is turned by {{}} about z against that of the attitude"
-        right, wrong = pair.other, pair.one
+        seen = pair
         if pair.name == ROTATION:
             names, cause = ("angular_velocity",), "the gyroscope is turned by {} about the body's z axis"
-            right, wrong = pair.one, pair.other
-        fault = turned(cause, turn_between(right, wrong), names, 0)
-        turn = about_z(-fault.angle)[: wrong.shape[1], : wrong.shape[1]].T
-        if pair.name == ROTATION:
-            left = replace(pair, other=wrong @ turn).left
-        else:
-            left = replace(
-                pair, one=wrong @ turn, beside=None if pair.beside is None else pair.beside @ turn
-            ).left
+            seen = replace(pair, one=pair.other, other=pair.one)
+        fault = turned(cause, seen.turn(), names, 0)
+        left = seen.turned_back(fault.angle).left
         spread = np.sqrt(left * pair.window / (2.0 * pair.seconds))
         if abs(fault.angle) < max(TOLD_ANGLE, 3.0 * spread) or pair.likelihood(left) < SURE:
             continue

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trueflight.groundstation.reading.faults import Columns, Fault
+from trueflight.groundstation.reading.faults import Columns, Fault, about_z, turn_between
 from trueflight.groundstation.reading.plausible import body_rate
 from trueflight.groundstation.reading.uniform import continuous_quaternion, segments, slopes
 from trueflight.models.frames import rotate
@@ -56,21 +56,27 @@ class Pair:
 
     @property
     def left(self) -> float:
-        """Share of the motion's energy by which the two differ; 0 where they agree, 2 where they are strangers."""
-        return self._share(self.one - self.other)
-
-    @property
-    def left_but_drag(self) -> float:
-        """The same, without what drag may take: it turns the phase as a delay does."""
+        """Share of the motion's energy by which the two differ, beyond what drag may take; 0 where they agree, 2 where
+        they are strangers."""
+        energy = 0.5 * (np.sum(self.one**2) + np.sum(self.other**2))
         differ = self.one - self.other
         if self.beside is not None:
             drag = -np.sum(differ * self.beside, axis=0) / np.maximum(np.sum(self.beside**2, axis=0), 1e-12)
             differ = differ + np.clip(drag, 0.0, MOST_DRAG) * self.beside
-        return self._share(differ)
-
-    def _share(self, differ: np.ndarray) -> float:
-        energy = 0.5 * (np.sum(self.one**2) + np.sum(self.other**2))
         return float(np.sum(differ**2) / max(energy, 1e-12))
+
+    def turned_back(self, angle: float) -> Pair:
+        """The pair with `one` turned about z by `-angle` rad."""
+        turn = about_z(-angle)[: self.one.shape[1], : self.one.shape[1]].T
+        return replace(self, one=self.one @ turn, beside=None if self.beside is None else self.beside @ turn)
+
+    def turn(self) -> float:
+        """The turn of `one` about z against `other` that leaves least, rad. Drag across what a circle gains looks
+        like a turn: both are fitted."""
+        if self.beside is None:
+            return turn_between(self.other, self.one)
+        angles = np.radians(np.arange(-180.0, 180.0))
+        return float(min(angles, key=lambda angle: self.turned_back(float(angle)).left))
 
     def likelihood(self, left: float) -> float:
         """Log likelihood that is gained where only the share `left` stays, every window counted once."""

@@ -262,3 +262,22 @@ def test_a_trajectory_later_than_its_attitude_is_shifted_back_without_an_imu(lat
     wrong = {n: shifted(dragged.t, good[n], late) for n in ("position", "velocity")}
     (check,) = [c for c in looked_at(dragged, {**good, **wrong}).checks if c.verdict == "undone"]
     assert check.late == pytest.approx(late, abs=0.01)
+
+
+@pytest.mark.parametrize("drag", [0.0, 0.4])
+@pytest.mark.parametrize("pace", [0.7, 1.5])
+def test_drag_in_a_circle_is_not_taken_for_a_turn(drag: float, pace: float) -> None:
+    """It stands at right angles to what the velocity gains, as a turn of the frame would have it."""
+    t = np.arange(0.0, 40.0, 0.01)
+    angle, generator = pace * t, np.random.default_rng(3)
+    velocity = 3.0 * pace * np.stack([-np.sin(angle), np.cos(angle), 0.0 * t], -1)
+    gained = -3.0 * pace**2 * np.stack([np.cos(angle), np.sin(angle), 0.0 * t], -1)
+    thrust = gained + drag * velocity + [0.0, 0.0, 9.81]
+    up = thrust / np.linalg.norm(thrust, axis=1, keepdims=True)
+    quaternion = np.stack([1.0 + up[:, 2], -up[:, 1], up[:, 0], 0.0 * t], -1)
+    columns = {
+        "velocity": velocity + 0.02 * generator.standard_normal(velocity.shape),
+        "quaternion": quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+    }
+    checks = reconcile(t, columns, np.ones(len(t), dtype=bool)).checks
+    assert not refusal(checks) and all(c.verdict in ("agrees", "cannot tell") for c in checks), checks
