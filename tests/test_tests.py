@@ -12,8 +12,6 @@ from groups import realtime
 
 FOLDER = Path(__file__).parent
 FILES = sorted(FOLDER.rglob("*.py"))
-NO_FLIGHT = {"test_json.py", "test_tests.py"}
-"""They start a vehicle for some seconds and hold nothing of its time."""
 
 
 def functions(path: Path) -> Iterator[ast.FunctionDef]:
@@ -82,9 +80,8 @@ def test_no_test_compares_a_thing_with_itself_or_an_interval_with_its_own_middle
 
 @pytest.mark.parametrize("path", [p for p in FILES if p.name.startswith("test_")], ids=lambda p: p.name)
 def test_what_flies_in_real_time_says_so(path: Path) -> None:
-    """One worker flies all of it: a vehicle, a companion or a port beside another's would starve it or take it."""
-    text = path.read_text()
-    flies = re.search(r"\b(free_ports?|Bridge|Companion|Px4Peer|ManInTheMiddle|Stage|Scene)\(", text)
-    assert flies is None or realtime(path) or path.name in NO_FLIGHT, (
-        f"{path.name} has `{flies[0] if flies else ''}`"
+    """One worker flies all of it: two companions at once would starve each other."""
+    flies = re.search(
+        r"\b(Companion|ManInTheMiddle|Scene)\(|conftest import Link|\"companion\", \"run\"", path.read_text()
     )
+    assert flies is None or realtime(path) or path.name == "test_tests.py", f"{path.name} has `{flies[0]}`"

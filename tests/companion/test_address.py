@@ -17,8 +17,6 @@ from trueflight.companion.address import checked_address, for_mavsdk, users_of, 
 from trueflight.companion.vehicle_link import VehicleLink
 from trueflight.models.errors import InputError
 
-pytestmark = pytest.mark.realtime
-
 
 @pytest.mark.parametrize(
     ("address", "line"),

@@ -20,8 +20,6 @@ from trueflight.companion.store import ModelStore
 from trueflight.companion.zenoh_session import ZenohSettings
 from trueflight.models.vehicle import load_vehicle
 
-pytestmark = pytest.mark.realtime
-
 
 def write(root: Path, name: str, text: str = "") -> Path:
     path = root / name

@@ -21,8 +21,6 @@ from trueflight.companion.preflight import hover_of, judge
 from trueflight.companion.required_parameters import required_parameters
 from trueflight.companion.settings import Settings
 
-pytestmark = pytest.mark.realtime
-
 
 @pytest.fixture
 def bridge(request: pytest.FixtureRequest) -> Iterator[tuple[Bridge, int]]:

@@ -20,8 +20,6 @@ from trueflight.groundstation.operate.settings import Settings as GroundSettings
 from trueflight.models.access import Keys, read_keys
 from trueflight.models.errors import InputError
 
-pytestmark = pytest.mark.realtime
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -9,8 +9,6 @@ import pytest
 from hostile_network import ATTACKS, Attack
 from network_stage import Stage
 
-pytestmark = pytest.mark.realtime
-
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:

@@ -72,11 +72,13 @@ def ends(link: Link, fault: Fault, *kinds: str) -> None:
     ("fault", "kinds"),
     [
         (frozen(), ("odometry_disagrees",)),
-        (frozen(only=("vx", "vy", "vz", "x", "y", "z")), ("odometry_disagrees",)),
+        pytest.param(
+            frozen(only=("vx", "vy", "vz", "x", "y", "z")), ("odometry_disagrees",), marks=pytest.mark.long
+        ),
         (frozen(stamp=True), ("no_odometry",)),
         (delayed(0.3, 331), ("late",)),
         (delayed(0.6, 331), ("stale", "failsafe", "odometry_gap", "no_odometry")),
-        (delayed(0.3), ("late",)),
+        pytest.param(delayed(0.3), ("late",), marks=pytest.mark.long),
     ],
     ids=[
         "frozen",
@@ -112,7 +114,7 @@ def test_a_small_reset_that_is_told_moves_nothing(hovering: Link) -> None:
         (reset(down=3.0), "estimator_reset"),
         (reset(down=-0.9, told=False), "position_jump"),
         (reset(turn=0.8), "estimator_reset"),
-        (reset(turn=-0.8, told=False), "heading_jump"),
+        pytest.param(reset(turn=-0.8, told=False), "heading_jump", marks=pytest.mark.long),
     ],
     ids=["far", "untold", "turned", "turned, untold"],
 )
@@ -147,7 +149,11 @@ def test_a_second_battery_hides_nothing(hovering: Link) -> None:
     assert hovering.companion.ticks[-1].phase == "mission"
 
 
-@pytest.mark.parametrize("direction", [(True,), (False,), (True, False)], ids=["down", "up", "both"])
+@pytest.mark.parametrize(
+    "direction",
+    [(True,), pytest.param((False,), marks=pytest.mark.long), (True, False)],
+    ids=["down", "up", "both"],
+)
 def test_a_lost_link_means_the_autopilots_failsafe(hovering: Link, direction: tuple[bool, ...]) -> None:
     begin = time.monotonic()
     hovering.middle.fault = lost(*direction)
