@@ -18,6 +18,8 @@ from trueflight.sim_bridge.settings import load_settings
 from trueflight.sim_bridge.truth.effects import EFFECTS
 from trueflight.sim_bridge.truth.hidden import RICH, choose, pool
 
+pytestmark = pytest.mark.realtime
+
 VEHICLE = ("--vehicle", str(QUAD5 / "vehicle.toml"))
 
 

@@ -31,6 +31,8 @@ from trueflight.sim_bridge.sitl.allocation import differences, expected_paramete
 from trueflight.sim_bridge.sitl.lockstep import Ending, Lockstep, listen
 from trueflight.sim_bridge.sitl.sensors import RawNoise, RawSensors
 
+pytestmark = pytest.mark.realtime
+
 IRIS = {
     **{"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": 4},
     **{f"PWM_MAIN_FUNC{i + 1}": 101 + i for i in range(4)},
