@@ -265,7 +265,9 @@ def test_rolled_back_by_command_in_flight_it_fades_to_the_previous_model(compani
 
 def test_in_a_flight_of_the_plain_cascade_a_model_is_shadowed_but_never_applied(companion: Companion) -> None:
     onnx = drag_model(0.12)
-    mission = companion.fly(trajectory="hover", parameters={"duration": 600.0})  # a busy machine inspects it slowly
+    mission = companion.fly(
+        trajectory="hover", parameters={"duration": 600.0}
+    )  # a busy machine inspects it slowly
     companion.phase("mission")
     assert deploy(companion, onnx)["state"] == "shadow"
     assert "next corrected flight" in told_of(companion, "model_live", onnx)
