@@ -17,7 +17,7 @@ settings.register_profile(
     "mutation", phases=[Phase.explicit, Phase.generate], database=None, derandomize=True
 )
 
-COMPUTING = 5
+COMPUTING = 10
 """Steps of niceness of the workers that do not fly: as many as run on each core leave a flight its greater part."""
 _begun: list[str] = []
 
