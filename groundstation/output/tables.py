@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -43,10 +44,13 @@ def print_comparisons(console: Console, comparisons: Sequence[Comparison]) -> No
         title=f"{first.flight.name}: measured minus predicted acceleration, RMS in m/s², heading frame, "
         f"below {first.bandwidth:g} Hz",
         title_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),  # whole on 80 columns
+        pad_edge=False,
     )
-    table.add_column("model", no_wrap=True)
+    table.add_column("model", overflow="fold")
     for a in first.axes:
-        table.add_column(a.axis, justify="right")
+        table.add_column(a.axis, justify="right", no_wrap=True)
         table.add_column("expl.", justify="right", no_wrap=True)
     for h in first.horizons:
         table.add_column(f"{h.horizon:g} s", justify="right", no_wrap=True)
@@ -54,7 +58,7 @@ def print_comparisons(console: Console, comparisons: Sequence[Comparison]) -> No
         cells = [c.label]
         for a in c.axes:
             cells += [f"{a.rms:.3f}", percent(a.share_explained)]
-        cells += [f"{100 * sum(x * x for x in h.position) ** 0.5:.1f} cm" for h in c.horizons]
+        cells += [f"{100 * sum(x * x for x in h.position) ** 0.5:.1f}" for h in c.horizons]
         table.add_row(*cells)
     cells = ["noise floor"]
     for a in first.axes:
@@ -63,7 +67,7 @@ def print_comparisons(console: Console, comparisons: Sequence[Comparison]) -> No
     console.print(table)
     told = "expl.: share of the linear model's squared error above the noise floor that is explained"
     if first.horizons:
-        told += "; times: position error of an open-loop prediction that long"
+        told += "; times: position error in cm of an open-loop prediction that long"
     console.print(told, style="dim")
     share = float(first.used.mean())
     if share < 0.95:

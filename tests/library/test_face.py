@@ -160,6 +160,7 @@ def test_comparisons_and_where(flight: tf.Flight, tmp_path: Path) -> None:
     assert len(c.to_pandas()) == len(flight)
     for chart in ("prediction", "over_time", "path"):
         c.plot(chart)
+    assert "…" not in printed("compare", DRAG / "identify.parquet"), "all numbers on 80 columns"
     where = tf.where(flight, store=tmp_path)
     assert {m.variable for m in where.maps} >= {"height", "tilt"}
     assert "Where it fails" in str(where.summary())
