@@ -9,6 +9,9 @@ import numpy as np
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model
 
+RISES = 1.005
+"""Times the residual before from which one is said to rise."""
+
 
 @dataclass(frozen=True)
 class AxisError:
@@ -214,11 +217,12 @@ class ParameterEstimate:
 class EffectVerdict:
     """What the flight says about one effect of the catalogue.
 
-    `verdict` is one of missing, possible, not_supported, not_excited, included. `variance_share` is the part
+    `verdict` is one of missing, possible, minor, not_supported, not_excited, included. `variance_share` is the part
     of the squared error before that the effect takes away, given the others; `p_value` robust to autocorrelation.
-    `rests_on` tells what the verdict stands on where more is left than noise. `undetermined` are parameters that this
-    flight does not determine, `products` what it determines of them instead. `seen_in` is "acceleration" or
-    "rotation": shares and ranks are each among their own.
+    `rests_on` tells what the verdict stands on where more is left than noise. `undetermined` are parameters that
+    this flight does not determine, `products` what it determines of them instead; `confidence` the probability that
+    the verdict is right (of a possible effect that it or one it names is there), None where none is known.
+    `seen_in` is "acceleration" or "rotation": shares and ranks are each among their own.
     """
 
     name: str
@@ -233,6 +237,7 @@ class EffectVerdict:
     rests_on: str = ""
     undetermined: tuple[str, ...] = ()
     products: tuple[ParameterEstimate, ...] = ()
+    confidence: float | None = None
 
 
 @dataclass(frozen=True)
@@ -274,6 +279,27 @@ class Diagnosis:
     left_out: dict[str, float]
     rotational: RotationalRms | None = None
     alternatives: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What has to be said of a residual that rises with what was found."""
+        said: list[str] = []
+        if not any(e.rank for e in self.effects):
+            return ()
+        if self.rms_after > RISES * self.rms_before:
+            said.append(
+                "the residual rises with what was found: an effect seen in the rotation does not show in the "
+                "thrust; do not add it before another flight shows it"
+            )
+        if (
+            self.validation_before is not None
+            and (self.validation_after or 0.0) > RISES * self.validation_before
+        ):
+            said.append(
+                "the held-out flight is predicted worse with what was found: it does not hold there, and may "
+                "have begun in flight"
+            )
+        return tuple(said)
 
     def named(self, verdict: str) -> tuple[str, ...]:
         """Names of the effects with this verdict, in order of rank."""

@@ -15,6 +15,8 @@ import numpy as np
 from scipy import stats
 
 MISSING, POSSIBLE, NOT_EXCITED, ABSENT = "missing", "possible", "not_excited", "not_supported"
+MINOR = "minor"
+"""Seen and told as too small to matter: it counts as found in a group."""
 OUTCOMES = (MISSING, POSSIBLE, NOT_EXCITED, ABSENT)
 """What may become of a hidden effect: named, in a group that contains it, told to be out of this flight's reach, or
 denied."""
@@ -104,7 +106,9 @@ class Case:
         told = self.of(name)
         if told is not None and told.verdict == MISSING:
             return MISSING
-        if (told is not None and told.verdict == POSSIBLE) or any(name in s.group for s in self.named()):
+        if (told is not None and told.verdict in (POSSIBLE, MINOR)) or any(
+            name in s.group for s in self.named()
+        ):
             return POSSIBLE
         return NOT_EXCITED if told is None or told.verdict == NOT_EXCITED else ABSENT
 
@@ -376,7 +380,7 @@ def claims_of(case: Case) -> list[Claim]:
     against any effect of the number of effects that were judged (one of them may be expected to be there). An effect of
     a group claims that one of the group is there.
     """
-    judged = [s for s in case.said if s.verdict in OUTCOMES]
+    judged = [s for s in case.said if s.verdict in (*OUTCOMES, MINOR)]
     odds = float(max(len(judged) - 1, 1))
     claims = []
     for s in judged:
@@ -384,6 +388,8 @@ def claims_of(case: Case) -> list[Claim]:
         if s.rank is not None and s.verdict in (MISSING, POSSIBLE):
             right = s.name in case.truth or any(n in case.truth for n in s.group)
             claims.append(Claim(case.number, s.name, True, there, right))
+        elif s.verdict == MINOR and s.confidence is not None:
+            claims.append(Claim(case.number, s.name, True, s.confidence, s.name in case.truth))
         elif s.verdict == ABSENT:
             sure = 1.0 - there if s.confidence is None else s.confidence
             claims.append(Claim(case.number, s.name, False, sure, s.name not in case.truth))

@@ -28,7 +28,7 @@ from trueflight.models.whole_file import whole_file
 if TYPE_CHECKING:
     from distributed import Client
 
-VERDICTS = ("missing", "possible", "not_supported", "not_excited", "included")
+VERDICTS = ("missing", "possible", "minor", "not_supported", "not_excited", "included")
 
 
 @dataclass(frozen=True)
@@ -318,7 +318,7 @@ def fleet_of(rows: Sequence[Row]) -> Fleet:
 
 def _how_often(effect: str, rows: Sequence[Row]) -> HowOften:
     counts = {verdict: sum(r.verdicts.get(effect) == verdict for r in rows) for verdict in VERDICTS}
-    could = counts["missing"] + counts["not_supported"]
+    could = counts["missing"] + counts["minor"] + counts["not_supported"]
     if could == 0:
         return HowOften(effect, counts, None, None, None)
     interval = stats.binomtest(counts["missing"], could).proportion_ci(method="wilson")

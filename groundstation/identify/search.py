@@ -43,6 +43,8 @@ STRONG_EVIDENCE = 6.0
 LINEARISED = 2.0
 """Factor that the linearised gain of an effect is trusted to, before a full fit is saved by it."""
 MOST_EFFECTS = 6
+ACTS = 1e-3
+"""Part of the held-out error from which an effect is said to act there."""
 SETS = 3
 """Sets of each size that are fitted in full where more than noise is left."""
 
@@ -170,7 +172,8 @@ def _score(state: State) -> float:
 class Search:
     """One search: states are kept by their set of choices, for the steps visit many sets again.
 
-    `tried` is the number of candidates that share the risk of a chance find, where it is not that of `problem`.
+    `tried` is the number of candidates that share the risk of a chance find, where it is not that of `problem`;
+    `dropped` are the effects that were left out because the held-out flight does not want them.
     """
 
     def __init__(
@@ -178,6 +181,7 @@ class Search:
     ) -> None:
         self.problem, self.progress = problem, progress
         self.significance = FAMILY / max(1, len(problem.choices) if tried is None else tried)
+        self.dropped: set[str] = set()
         self._states: dict[frozenset[Choice], State] = {}
         self._sets: dict[frozenset[Choice], tuple[State, ...]] = {}
 
@@ -296,17 +300,20 @@ class Search:
         return not needed or not set(needed).isdisjoint(present)
 
     def _agreed_by_held_out(self, current: State) -> State:
-        """Drop effects that predict the held-out flight worse than the model without them."""
+        """Drop effects that predict the held-out flight no better than the model without them does, where they act
+        there at all."""
         while current.choices:
             here = self.problem.held_out_error(current.fit)
             if here is None:
                 break
             others = [self.without(current, choice) for choice in current.choices]
             errors = [(self.problem.held_out_error(other.fit) or 0.0, other) for other in others]
-            worse = [e for e in errors if e[0] < here * (1.0 - MATERIAL_SHARE)]
+            worse = [e for e in errors if e[0] < here * (1.0 - ACTS)]
             if not worse:
                 break
-            current = min(worse, key=lambda e: e[0])[1]
+            following = min(worse, key=lambda e: e[0])[1]
+            self.dropped |= {*current.names} - {*following.names}
+            current = following
         return current
 
     # --- other sets -----------------------------------------------------------------------------------------

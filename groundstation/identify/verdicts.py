@@ -1,4 +1,5 @@
-"""What a search found, in verdicts: missing, possible, not supported, not excited; with the advice that goes with each.
+"""What a search found, in verdicts: missing, possible, minor, not supported, not excited; with the advice that goes
+with each, and how sure it is.
 
 `identify.search` finds; here it is judged what was not found, and said in words.
 """
@@ -9,15 +10,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import special
 
 from trueflight.groundstation.identify.doubt import Weighing
-from trueflight.groundstation.identify.fitting import Fit
+from trueflight.groundstation.identify.fitting import Fit, variance_per_independent_sample
 from trueflight.groundstation.identify.search import Search, State
 from trueflight.groundstation.results import EffectVerdict, ParameterEstimate
 from trueflight.models.effect import Effect
 
-MISSING, POSSIBLE, NOT_SUPPORTED, NOT_EXCITED, INCLUDED = (
-    "missing", "possible", "not_supported", "not_excited", "included",
+MISSING, POSSIBLE, MINOR, NOT_SUPPORTED, NOT_EXCITED, INCLUDED = (
+    "missing", "possible", "minor", "not_supported", "not_excited", "included",
 )  # fmt: skip
 
 
@@ -66,11 +68,24 @@ def judge(
                 _add(effect) if sure else _tell(same, effect),
                 scale.seen_in,
                 "" if weighed is None else weighed.told,
+                confidence=_there(search, current.fit, search.without(current, choice).fit)
+                * (1.0 if weighed is None else weighed.trust),
             )
         )
+    doubtful = doubt is not None
     absent = dict.fromkeys(c.effect for c in search.problem.choices if c.effect not in current.names)
     stood_for = {n: [c.effect for c, same in rivals.items() if n in same] for n in absent}
-    return found, [_absent(search, current, scale, n, stood_for[n]) for n in absent]
+    return found, [_absent(search, current, scale, n, stood_for[n], doubtful) for n in absent]
+
+
+def _there(search: Search, with_: Fit, without: Fit) -> float:
+    """Probability of what one fit has beyond another: the evidence, less two for each number, against odds of the
+    number of candidates (one of them may be expected to be there). The slow error that every flight is granted
+    is counted, so that what is below it is never sure."""
+    unit = max(variance_per_independent_sample(search.problem, with_.residual), search.problem.unit())
+    price = 2.0 * (len(with_.free) - len(without.free)) + with_.prior_penalty - without.prior_penalty
+    log_odds = 0.5 * ((without.sse - with_.sse) / unit - price)
+    return float(special.expit(log_odds - np.log(max(len(search.problem.choices), 1))))
 
 
 def _somewhere(figures: Fit, name: str) -> bool:
@@ -82,7 +97,7 @@ def _somewhere(figures: Fit, name: str) -> bool:
 
 
 def _absent(
-    search: Search, current: State, scale: Scale, name: str, stands_for: Sequence[str]
+    search: Search, current: State, scale: Scale, name: str, stands_for: Sequence[str], doubtful: bool
 ) -> EffectVerdict:
     problem = search.problem
     effect, own = problem.effects[name], [c for c in problem.choices if c.effect == name]
@@ -98,9 +113,16 @@ def _absent(
     extended = min(tried, key=lambda f: f.sse)
     share, p = (current.fit.sse - extended.sse) / scale.before, extended.wald(name)
 
+    there = _there(search, extended, current.fit)
+
     def verdict(word: str, figures: Fit, rivals: Sequence[str], advice: str) -> EffectVerdict:
         told = estimates(figures, name)
-        return EffectVerdict(name, word, None, share, p, told, tuple(rivals), advice, scale.seen_in)
+        sure = {MINOR: there, NOT_SUPPORTED: 1.0 - there}.get(word)
+        if name in search.dropped or (doubtful and there > 0.5):
+            sure = None  # what is left, or another flight, speaks against what is seen
+        return EffectVerdict(
+            name, word, None, share, p, told, tuple(rivals), advice, scale.seen_in, confidence=sure
+        )
 
     if stands_for:
         # as a stand-in for the effect found, not beside it
@@ -111,10 +133,11 @@ def _absent(
         return verdict(POSSIBLE, min(swapped, key=lambda f: f.sse), stands_for, _tell(stands_for, effect))
     if not all(search.excited(current, c, through) for c in own):
         return verdict(NOT_EXCITED, extended, (), f"to see it, fly {effect.manoeuvre}")
-    seen = p < search.significance and share > 0.0
-    return verdict(
-        NOT_SUPPORTED, extended, (), f"seen, but too small to matter here{scale.told(share)}" if seen else ""
-    )
+    if name in search.dropped:
+        return verdict(MINOR, extended, (), "it takes nothing away from the error on the held-out flight")
+    seen = p < search.significance and share > 0.0 and not doubtful
+    small = f"seen, but too small to matter here{scale.told(share)}"
+    return verdict(MINOR if seen and there > 0.5 else NOT_SUPPORTED, extended, (), small if seen else "")
 
 
 def by_weight(verdicts: Sequence[EffectVerdict]) -> list[EffectVerdict]:

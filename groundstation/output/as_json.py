@@ -80,6 +80,7 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
                 "indistinguishable_from": list(e.indistinguishable_from),
                 "advice": e.advice,
                 "seen_in": e.seen_in,
+                "confidence": e.confidence,
                 "rests_on": e.rests_on,
                 "undetermined": list(e.undetermined),
                 "products": {
@@ -89,6 +90,7 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
             }
             for e in d.effects
         ],
+        "remarks": list(d.remarks),
         "alternatives": [list(names) for names in d.alternatives],
         "unexplained": asdict(d.unexplained),
         "nuisance": {"clock_shift": {"value": d.clock_shift, "unit": "s"}},

@@ -20,6 +20,7 @@ VERDICT_STYLE = {
     "missing": "bold red",
     "possible": "yellow",
     "included": "green",
+    "minor": "dim",
     "not_excited": "cyan",
     "not_supported": "dim",
 }
@@ -27,6 +28,7 @@ SAID = {
     "missing": "MISSING",
     "possible": "possible",
     "included": "in the model",
+    "minor": "minor",
     "not_excited": "not excited",
     "not_supported": "not supported",
 }
@@ -109,6 +111,7 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
         table.add_column("verdict", no_wrap=True)
         table.add_column("share of\nerror", justify="right")
         table.add_column("parameters, 95 % interval", no_wrap=True)
+        table.add_column("sure", justify="right")
         table.add_column("not told from")
         for e in shown:
             table.add_row(
@@ -116,6 +119,7 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
                 Text(SAID[e.verdict], style=VERDICT_STYLE[e.verdict]),
                 percent(e.variance_share) if e.rank else "",
                 _parameters(e),
+                "" if e.confidence is None else percent(min(e.confidence, 0.999)),
                 ", ".join(e.indistinguishable_from),
             )
         console.print(table)
@@ -127,6 +131,8 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
     if d.validation_before is not None and d.validation_after is not None:
         line += f"; held-out flight {d.validation_before:.3f} -> {d.validation_after:.3f} m/s²"
     console.print(Text(line, style="bold"))
+    for remark in d.remarks:
+        console.print(remark, style="yellow", highlight=False)
     if d.rotational is not None:
         r = d.rotational
         console.print(
@@ -150,7 +156,7 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
             rests = f"; {e.rests_on}" if e.rests_on else ""
             console.print(f"[bold]{e.name}[/bold]: {e.advice}{rests}", highlight=False)
     for e in d.effects:
-        if e.verdict in ("possible", "not_excited") and e.advice:
+        if e.verdict in ("possible", "minor", "not_excited") and e.advice:
             rests = f"; {e.rests_on}" if e.rests_on else ""
             console.print(f"[dim]{SAID[e.verdict]}[/dim] {e.name}: {e.advice}{rests}", highlight=False)
 

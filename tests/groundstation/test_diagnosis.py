@@ -192,6 +192,7 @@ def test_json_has_the_agreed_shape() -> None:
     assert {e["verdict"] for e in table["effects"]} <= {
         "missing",
         "possible",
+        "minor",
         "not_supported",
         "not_excited",
         "included",
