@@ -126,16 +126,17 @@ class Effect:
 
     `needs` names the columns of `models.flight.COLUMNS` it reads, `needs_any` those of which one is enough;
     `needs_accelerometer` is True for an error of that sensor: no acceleration that was differentiated or estimated
-    has it; `acts_through` the effects of which one must be in the model for this one to act (wind acts through drag);
-    `exports` is False for an effect with memory, which a static correction cannot hold. `generalises` names simpler
-    effects with which this one coincides unless the flight varies what it depends on (a bent thrust curve in a hover
-    is a thrust gain). `aliases` are physical quantities that no flight can tell apart from this effect.
-    `unconfounded` is the reason why an effect has no confounder. `rotational` effects are found in the angular
-    acceleration; `seen_as` names the effects that such a one is taken for where the flight lacks the columns to tell.
-    `exclusive` is True where at most one of the parameters acts (the one rotor that is damaged): each is then a
-    candidate on its own. `typical_for` gives sizes that depend on where the flight went (a ceiling just above its
-    highest point) instead of the parameters' own; `starts_for` further values to begin a fit from, where one start
-    may end in a wrong optimum.
+    has it; `noisy` names those of its columns whose noise is not small beside what it does; `acts_through` the
+    effects of which one must be in the model for this one to act (wind acts through drag); `exports` is False for
+    an effect with memory, which a static correction cannot hold. `generalises` names simpler effects with which
+    this one coincides unless the flight varies what it depends on (a bent thrust curve in a hover is a thrust
+    gain). `aliases` are physical quantities that no flight can tell apart from this effect. `unconfounded` is the
+    reason why an effect has no confounder. `rotational` effects are found in the angular acceleration; `seen_as`
+    names the effects that such a one is taken for where the flight lacks the columns to tell. `exclusive` is True
+    where at most one of the parameters acts (the one rotor that is damaged): each is then a candidate on its own.
+    `typical_for` gives sizes that depend on where the flight went (a ceiling just above its highest point) instead
+    of the parameters' own; `starts_for` further values to begin a fit from, where one start may end in a wrong
+    optimum.
 
     The rest are parts that few effects play; an effect that leaves them out is treated as one that acts between the
     rotors and the acceleration. `exact_rotation` is True for what turns thrust exactly: every diagnosis starts from
@@ -165,6 +166,7 @@ class Effect:
     exports: bool = True
     needs_any: tuple[str, ...] = ()
     needs_accelerometer: bool = False
+    noisy: tuple[str, ...] = ()
     unconfounded: str = ""
     rotational: bool = False
     seen_as: tuple[str, ...] = ()

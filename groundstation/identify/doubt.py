@@ -23,9 +23,9 @@ SMOOTHING = 0.3
 """Width of the band over which the spectrum of what is left is averaged, as a part of its frequency."""
 NARROWEST = 2
 """Frequencies of a flight on either side that are averaged at least."""
-SAME = 1.0 / 3.0
-"""Part of what an effect does by which frequencies or parts of the flight may differ: lags of some ms and a law that is
-not quite that of the vehicle make a quarter."""
+SAME = 0.25
+"""Part of what an effect does by which frequencies or parts of the flight may differ: lags of some ms, and a law that
+is not quite that of the vehicle, make less."""
 MASTERED = 0.5
 """Most that may be left at an effect's own frequencies, over what it does, both RMS: what does not twice outweigh a
 discrepancy may be made of it."""

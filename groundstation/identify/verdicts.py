@@ -72,7 +72,8 @@ def judge(
                 * (1.0 if weighed is None else weighed.trust),
             )
         )
-    doubtful = doubt is not None
+    # nobody grants the rotation the slow error that every acceleration has: what is small in it is sure of nothing
+    doubtful = doubt is not None or scale.seen_in == "rotation"
     absent = dict.fromkeys(c.effect for c in search.problem.choices if c.effect not in current.names)
     stood_for = {n: [c.effect for c, same in rivals.items() if n in same] for n in absent}
     return found, [_absent(search, current, scale, n, stood_for[n], doubtful) for n in absent]
@@ -135,9 +136,10 @@ def _absent(
         return verdict(NOT_EXCITED, extended, (), f"to see it, fly {effect.manoeuvre}")
     if name in search.dropped:
         return verdict(MINOR, extended, (), "it takes nothing away from the error on the held-out flight")
-    seen = p < search.significance and share > 0.0 and not doubtful
+    seen = p < search.significance and share > 0.0
     small = f"seen, but too small to matter here{scale.told(share)}"
-    return verdict(MINOR if seen and there > 0.5 else NOT_SUPPORTED, extended, (), small if seen else "")
+    minor = seen and there > 0.5 and not doubtful
+    return verdict(MINOR if minor else NOT_SUPPORTED, extended, (), small if seen else "")
 
 
 def by_weight(verdicts: Sequence[EffectVerdict]) -> list[EffectVerdict]:

@@ -36,6 +36,7 @@ EFFECT = Effect(
     ),
     needs=("specific_force", "angular_velocity", "thrust_command"),
     needs_accelerometer=True,
+    noisy=("angular_velocity",),
     manoeuvre="quick rolls, pitches and yaws both ways, at constant thrust",
     citation="acceleration of a point of a rigid body, Goldstein, Classical Mechanics, ch. 4; "
     "Titterton & Weston, Strapdown Inertial Navigation Technology (size effect)",

@@ -19,7 +19,7 @@ from trueflight.models.frames import rotate_inverse
 from trueflight.models.model import rigid_body_model
 from trueflight.models.reference import trajectory_from_csv
 from trueflight.models.trajectory import Trajectory
-from trueflight.sim_bridge.truth.hidden import Hidden
+from trueflight.sim_bridge.truth.hidden import Hidden, choose
 
 
 def said_of(flight: Flight) -> Diagnosis:
@@ -131,3 +131,16 @@ def test_a_curve_that_swallows_a_gain_and_the_ground_is_not_called_missing(tmp_p
     assert set(found.named("missing")) <= {"thrust_gain", "ground_effect"}
     named = {*found.named("missing"), *found.named("possible"), *(n for s in found.alternatives for n in s)}
     assert {"thrust_gain", "ground_effect"} <= named
+
+
+def test_a_noisy_gyroscope_does_not_make_the_lever_arm_smaller() -> None:
+    flight = simulated(4, "imu_lever_arm")
+    (hidden,) = choose(["imu_lever_arm"], flight.vehicle, 4)
+    rng = np.random.default_rng(1)
+    shaken = flight.angular_velocity + rng.normal(0.0, 0.03, flight.angular_velocity.shape)
+    found = said_of(replace(flight, angular_velocity=shaken))
+    (told,) = (e for e in found.effects if e.name == "imu_lever_arm")
+    for p in told.parameters:
+        assert p.low < hidden.parameters[p.name] < p.high, p
+    x = told.parameters[0]
+    assert x.value == pytest.approx(hidden.parameters["x"], rel=0.04)  # 30 % less where the noise is left in
