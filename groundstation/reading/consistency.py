@@ -95,7 +95,8 @@ def reconcile(t: np.ndarray, columns: Columns, flying: np.ndarray) -> Reconciled
     notes += [c.text for c in checks if c.verdict in ("undone", "weak")]
     if still := [c.pair for c in checks if c.text == TOO_LITTLE]:
         notes.append(f"{', '.join(still)}: {TOO_LITTLE}; axes, units and frames are taken as they stand")
-    notes += [c.text for c in checks if c.verdict == "agrees" and c.text and c.text != UNTOLD]
+    agreeing = [c.text.removeprefix(UNTOLD).removeprefix("; ") for c in checks if c.verdict == "agrees"]
+    notes += [text for text in agreeing if text]
     return Reconciled(keep, columns, checks, rates, tuple(notes))
 
 
