@@ -69,8 +69,9 @@ class Weighed:
     @property
     def trust(self) -> float:
         """Probability that what is there is this effect and not what is left: in seeded flights with falling payloads,
-        swinging loads and gusts 27 of 29 effects were right that vary by less than a third, and 3 of 20 beyond."""
-        worst = max(self.moved, self.varies, self.shared)
+        swinging loads and gusts 27 of 29 effects were right that vary by less than a third, and 3 of 16 that go by more
+        with frequency or the scale of thrust. That parts of the flight differ speaks against its constancy alone."""
+        worst = max(self.moved, self.shared)
         doubt = max(worst / HALF_TRUSTED, np.sqrt(self.beside) / (1.5 * MASTERED))
         return float(1.0 / (1.0 + doubt**3)) if self.p_value < ALPHA else 0.5
 
@@ -85,7 +86,10 @@ class Weighed:
             return "of one size at every frequency and throughout the flight, beside what is left unexplained"
         worst, why = max(
             (self.moved, "quick and slow motion differ on its size by {:.0%}"),
-            (self.varies, "parts of the flight differ on its size by {:.0%}"),
+            (
+                self.varies,
+                "parts of the flight differ on its size by {:.0%}: it may have begun or changed in flight",
+            ),
             (self.shared, "{:.0%} of it goes where the scale of thrust may change in flight"),
         )
         return why.format(min(worst, 9.99)).replace("%", " %")
@@ -93,9 +97,10 @@ class Weighed:
 
 class Weighing:
     """The fit `here` of flights measured at `measurements`, estimated again with each frequency weighted by what is
-    left at it; `floor` (A,) is the noise of each axis, RMS."""
+    left at it; `floor` (A,) is the noise of each axis, RMS. Where it is `quiet`, nothing is said of what is steady."""
 
-    def __init__(self, problem: Problem, here: Fit, floor: np.ndarray) -> None:
+    def __init__(self, problem: Problem, here: Fit, floor: np.ndarray, quiet: bool = False) -> None:
+        self.quiet = quiet
         self.here, self.problem, measurements = here, problem, problem.measurements
         count = len(here.free)
         normal = np.zeros((count, count))  # of least squares

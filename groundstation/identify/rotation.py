@@ -9,7 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from trueflight.groundstation.identify.actuation import fit_rate_loop
+from trueflight.groundstation.identify.adequacy import ABOVE
+from trueflight.groundstation.identify.doubt import Weighing
 from trueflight.groundstation.identify.search import Search
 from trueflight.groundstation.identify.torque import TorqueProblem, turning_of
 from trueflight.groundstation.identify.verdicts import Scale, by_weight, judge, unmeasured
@@ -45,7 +49,11 @@ def judge_rotation(
     search = Search(problem)
     before, found = search.state(()), search.select()
     scale = Scale(before.fit.sse, lambda share: "", "rotation")
-    named, absent = judge(search, found, found.fit, scale)
+    r = problem.turning.rotation
+    left = found.fit.residual / problem.weight
+    noise_alone = bool(np.all(np.sqrt(np.mean(left**2, axis=0)) < ABOVE * r.noise))
+    doubt = Weighing(problem, found.fit, r.noise * problem.weight, quiet=noise_alone)
+    named, absent = judge(search, found, found.fit, scale, doubt=doubt)
     others = [unmeasured(effects[n], c) for n, c in missing.items() if n not in measurable]
     rms = problem.rms(before.fit, found.fit)
     return RotationalFindings((*named, *by_weight(absent), *others), found.fit.terms, rms)

@@ -55,6 +55,8 @@ def judge(
     for rank, (share, choice) in enumerate(ranked, 1):
         effect, same = search.problem.effects[choice.effect], rivals[choice]
         weighed = None if doubt is None else doubt.of(effect.name)
+        if doubt is not None and doubt.quiet and weighed is not None and weighed.steady:
+            weighed = None
         sure = not same and (weighed is None or weighed.holds) and _somewhere(figures, effect.name)
         found.append(
             EffectVerdict(
