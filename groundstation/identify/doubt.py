@@ -34,7 +34,9 @@ HALF_TRUSTED = 0.5
 PARTS = 8
 """Parts of a flight in which an effect is to have the same size."""
 ALPHA = 0.01
-"""Probability that an effect that is there is said to have two sizes, or that chance is called an effect."""
+"""Probability that an effect that is there is said to have two sizes."""
+CHANCE = 5e-4
+"""Probability that chance is called an effect: 0.01 over twenty candidates."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class Weighed:
     @property
     def holds(self) -> bool:
         """Whether it is there whatever else is."""
-        return self.steady and self.p_value < ALPHA and self.beside < MASTERED**2
+        return self.steady and self.p_value < CHANCE and self.beside < MASTERED**2
 
     @property
     def trust(self) -> float:
@@ -73,12 +75,12 @@ class Weighed:
         with frequency or the scale of thrust. That parts of the flight differ speaks against its constancy alone."""
         worst = max(self.moved, self.shared)
         doubt = max(worst / HALF_TRUSTED, np.sqrt(self.beside) / (1.5 * MASTERED))
-        return float(1.0 / (1.0 + doubt**3)) if self.p_value < ALPHA else 0.5
+        return float(1.0 / (1.0 + doubt**3)) if self.p_value < CHANCE else 0.5
 
     @property
     def told(self) -> str:
         """What a verdict on it rests on."""
-        if self.p_value >= ALPHA:
+        if self.p_value >= CHANCE:
             return "weighed with the spectrum of what is left, it may be nothing"
         if self.beside >= MASTERED**2:
             return "it does less than twice what is left unexplained at the same frequencies"
@@ -155,7 +157,8 @@ class Weighing:
             self._varies(own, plain),
             self._shared(effect, own, plain),
             self._beside(own, plain),
-            float(stats.chi2.sf(statistic, len(own))),
+            # the density of what is left is itself known from a few frequencies only
+            float(stats.f.sf(statistic / len(own), len(own), 2 * (2 * NARROWEST + 1))),
         )
 
     def _moved(self, own: list[int], step: np.ndarray, plain: np.ndarray) -> float:
