@@ -12,6 +12,7 @@ import numpy as np
 
 from trueflight.models.errors import InputError
 from trueflight.models.outside import is_number, numbers, read_toml, shown
+from trueflight.models.shipped import QUAD5 as QUAD5  # where users look for it
 
 GRAVITY = 9.81
 """Standard gravity of the project, m/s²."""
