@@ -26,7 +26,9 @@ class Scene:
     def __init__(self, folder: Path, before: str = "", settings: str = "") -> None:
         self.folder, self._before, self._settings = folder, before, settings
         self.middle = ManInTheMiddle()
-        parameters = (f"COM_OF_LOSS_T={LOSS_TIME}", "COM_OBL_RC_ACT=4")
+        # how hard it comes down is promised: it lands as PX4 does of itself, not as quickly as tests of other things
+        landing = ("MPC_LAND_SPEED=0.7", "COM_DISARM_LAND=2")
+        parameters = (f"COM_OF_LOSS_T={LOSS_TIME}", "COM_OBL_RC_ACT=4", *landing)
         try:
             self.bridge = Bridge(self.middle.port, *(x for p in parameters for x in ("--param", p)))
         except BaseException:
