@@ -130,6 +130,8 @@ def _agreement(windows: Windows, columns: Columns, pair: Pair) -> Check:
     they are looked at alone. Told where they seem to point elsewhere, or where the flight does not tell it."""
     if pair.name == TILT:
         return Check(pair.name, "agrees", pair.left, _unsure_axes(windows, columns, pair))
+    if pair.name == MOTION:
+        return _mirrored(windows, columns, pair)
     if pair.name != FORCE:
         return Check(pair.name, "agrees", pair.left)
     name = "specific_force"
@@ -150,6 +152,22 @@ def _agreement(windows: Windows, columns: Columns, pair: Pair) -> Check:
         return Check(pair.name, "weak", pair.left, text, fault.mapping, fault.angle)
     told = all(other.likelihood(pair.left) > SURE for other, _ in others)
     return Check(pair.name, "agrees", pair.left, "" if told else UNTOLD)
+
+
+def _mirrored(windows: Windows, columns: Columns, pair: Pair) -> Check:
+    """That position and velocity agree; each axis by itself, for one that hardly moves is nothing beside the others."""
+    unsure = []
+    for fault in single_faults({"position": columns["position"]}, only_mirrored=True):
+        (other,) = windows.mended(columns, [pair], fault)
+        if pair.likelihood(other.left) > SURE:
+            text = f"{fault.cause}, it seems: heights and places rest on it"
+            return Check(pair.name, "weak", pair.left, text, fault.mapping)
+        if fault.axes is not None and np.trace(fault.axes) == 1.0 and other.likelihood(pair.left) < SURE:
+            unsure.append("xyz"[int(np.argmin(np.diag(fault.axes)))])
+    if not unsure:
+        return Check(pair.name, "agrees", pair.left)
+    text = f"which way {' and '.join(unsure)} of the position points the flight moves too little to tell"
+    return Check(pair.name, "agrees", pair.left, text)
 
 
 def _unsure_axes(windows: Windows, columns: Columns, pair: Pair) -> str:

@@ -237,6 +237,10 @@ def outcome(
     plain = set(right.notes)
     if any(note not in plain for note in got.notes):
         return "named" if restored(right, got, case.needs) else "told"
+    if "late" in case.kind and any("late: the flight moves too little" in note for note in got.notes):
+        return "told"  # as it was before
+    if "position" in case.needs and any("which way" in c.text for c in got.consistency):
+        return "told"
     if "specific_force" in case.needs and any("too little along x and y" in c.text for c in got.consistency):
         return "told"
     try:

@@ -281,3 +281,15 @@ def test_drag_in_a_circle_is_not_taken_for_a_turn(drag: float, pace: float) -> N
     }
     checks = reconcile(t, columns, np.ones(len(t), dtype=bool)).checks
     assert not refusal(checks) and all(c.verdict in ("agrees", "cannot tell") for c in checks), checks
+
+
+def test_an_axis_that_hardly_moves_is_looked_at_by_itself(flight: Flight) -> None:
+    """Beside what x and y move, z is next to nothing; mirrored it is told, and where it stands still that is said."""
+    good = columns_of(flight, "specific_force", "quaternion", "angular_velocity")
+    low = {n: c * [1.0, 1.0, 0.05] for n, c in good.items()}
+    (check,) = looked_at(flight, low).checks
+    assert check.verdict == "agrees" and not check.text
+    (check,) = looked_at(flight, by(np.diag([1.0, 1.0, -1.0]), "position")(low)).checks
+    assert check.verdict in ("weak", "contradicts") and "x, y, -z" in check.text
+    (check,) = looked_at(flight, {n: c * [1.0, 1.0, 0.0] for n, c in good.items()}).checks
+    assert check.verdict == "agrees" and "which way z of the position" in check.text
