@@ -22,6 +22,9 @@ from trueflight.models.vehicle import GRAVITY, Vehicle
 DESCENT, BELOW_CEILING = "descent", "below_ceiling"
 """Flights that alone show some effects: a fast descent into one's own wake; close below something that hangs."""
 
+VEHICLE, FLIGHT = "vehicle", "flight"
+"""Whose a number is: one for every flight of a vehicle (drag), or one for each flight (wind)."""
+
 
 class Stage(IntEnum):
     """When an effect acts, on the way from command to measurement. Effects of one stage commute."""
@@ -99,7 +102,10 @@ class Parameter:
     physically plausible range, `typical` a size that matters in flight: the diagnosis asks whether a flight could
     have shown an effect of that size, and fits start there. `structural` marks a number that says where an effect
     acts and not how much (the height of a ceiling): it is fitted, but no value of it is "no effect". `even` marks one
-    that acts by its square, so that its sign means nothing.
+    that acts by its square, so that its sign means nothing. `belongs_to` says whose number it is where several flights
+    are looked at together: the `VEHICLE`'s, the same in all of them, or each `FLIGHT`'s own.
+
+    Raises `ValueError` for any other owner.
     """
 
     name: str
@@ -114,6 +120,13 @@ class Parameter:
     clock_samples: float = 0.0
     actuation: str = ""
     truth: str = ""
+    belongs_to: str = VEHICLE
+
+    def __post_init__(self) -> None:
+        if self.belongs_to not in (VEHICLE, FLIGHT):
+            raise ValueError(
+                f"parameter '{self.name}' belongs_to {self.belongs_to!r}; it is VEHICLE or FLIGHT"
+            )
 
     def neutral_for(self, vehicle: Vehicle) -> float:
         """The value at which the effect does nothing beyond what the vehicle file already says."""

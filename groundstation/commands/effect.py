@@ -61,11 +61,14 @@ def _print_catalogue(effects: Sequence[Effect]) -> None:
 
 
 def _print_effect(e: Effect) -> None:
+    from trueflight.models.effect import FLIGHT
+
     console.print(f"[bold]{e.name}[/bold]: {e.title}")
     console.print(" ".join((e.formula.__doc__ or "").split()), highlight=False, markup=False)
     for p in e.parameters:
         unit = "" if p.unit == "1" else f" {p.unit}"
-        console.print(f"  {p.name}: {p.meaning}, {p.low:g} to {p.high:g}{unit}")
+        own = ", each flight's own" if p.belongs_to == FLIGHT else ""
+        console.print(f"  {p.name}: {p.meaning}, {p.low:g} to {p.high:g}{unit}{own}")
     either = f"{', ' if e.needs else ''}{' or '.join(e.needs_any)}" if e.needs_any else ""
     sensor = ", from an accelerometer" if e.needs_accelerometer else ""
     console.print(f"needs: {', '.join(e.needs)}{either}{sensor}")

@@ -306,7 +306,14 @@ def effect_table(e: Effect) -> dict[str, Any]:
         "title": e.title,
         "formula": " ".join((e.formula.__doc__ or "").split()),
         "parameters": {
-            p.name: {"unit": p.unit, "meaning": p.meaning, "low": p.low, "high": p.high} for p in e.parameters
+            p.name: {
+                "unit": p.unit,
+                "meaning": p.meaning,
+                "low": p.low,
+                "high": p.high,
+                "belongs_to": p.belongs_to,
+            }
+            for p in e.parameters
         },
         "needs": list(e.needs),
         "needs_any": list(e.needs_any),

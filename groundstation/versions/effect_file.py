@@ -50,6 +50,7 @@ EFFECT = Effect(
     formula=formula,
     # Name, unit, meaning, value without effect, a size that matters in flight, plausible range. The typical size
     # decides whether a flight could have shown the effect; a value outside the range is never called missing.
+    # belongs_to=FLIGHT (from trueflight.models.effect) for a number that is each flight's own, as wind is.
     parameters=(Parameter("pull", "1/s^2", "weight over mass and height", 0.0, 0.1, 0.0, 2.0),),
     # Columns of a flight that the formula reads: quaternion, position, velocity, thrust_command, battery_voltage,
     # angular_velocity, specific_force, rotor_speed, ...

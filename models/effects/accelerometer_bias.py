@@ -2,7 +2,7 @@
 
 from array_api_compat import array_namespace
 
-from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import FLIGHT, Array, Effect, Motion, Parameter, Stage
 
 
 def formula(motion: Motion, *, x: Array, y: Array, z: Array) -> Motion:
@@ -18,7 +18,9 @@ EFFECT = Effect(
     stage=Stage.SENSOR,
     formula=formula,
     parameters=tuple(
-        Parameter(axis, "m/s^2", f"offset along body {axis}", 0.0, 0.1, -0.8, 0.8, truth=axis)
+        Parameter(
+            axis, "m/s^2", f"offset along body {axis}", 0.0, 0.1, -0.8, 0.8, truth=axis, belongs_to=FLIGHT
+        )
         for axis in ("x", "y", "z")
     ),
     needs=("specific_force",),

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from array_api_compat import array_namespace
 
-from trueflight.models.effect import BELOW_CEILING, Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import BELOW_CEILING, FLIGHT, Array, Effect, Motion, Parameter, Stage
 
 STRONGEST = 0.6
 """Largest value of the squared ratio: nearer to the ceiling the formula leaves its range."""
@@ -59,7 +59,15 @@ EFFECT = Effect(
     parameters=(
         Parameter("rho", "1", "multiplier of the rotor radius", 0.0, 1.5, 0.0, 6.0, even=True),
         Parameter(
-            "ceiling", "m", "height of the ceiling above ground", 3.0, 3.0, LOWEST, HIGHEST, structural=True
+            "ceiling",
+            "m",
+            "height of the ceiling above ground",
+            3.0,
+            3.0,
+            LOWEST,
+            HIGHEST,
+            structural=True,
+            belongs_to=FLIGHT,
         ),
     ),
     needs=("quaternion", "position", "thrust_command"),

@@ -2,7 +2,7 @@
 
 from array_api_compat import array_namespace
 
-from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import FLIGHT, Array, Effect, Motion, Parameter, Stage
 
 
 def formula(motion: Motion, *, x: Array, y: Array) -> Motion:
@@ -20,8 +20,8 @@ EFFECT = Effect(
     stage=Stage.AIR,
     formula=formula,
     parameters=(
-        Parameter("x", "m/s", "wind towards east", 0.0, 2.0, -20.0, 20.0, truth="east"),
-        Parameter("y", "m/s", "wind towards north", 0.0, 2.0, -20.0, 20.0, truth="north"),
+        Parameter("x", "m/s", "wind towards east", 0.0, 2.0, -20.0, 20.0, truth="east", belongs_to=FLIGHT),
+        Parameter("y", "m/s", "wind towards north", 0.0, 2.0, -20.0, 20.0, truth="north", belongs_to=FLIGHT),
     ),
     needs=("quaternion", "velocity", "thrust_command"),
     manoeuvre="translations in all directions and a slow full turn in yaw",

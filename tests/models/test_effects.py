@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trueflight.models.effect import Effect, Motion, Stage
+from trueflight.models.effect import FLIGHT, Effect, Motion, Parameter, Stage
 from trueflight.models.effects import catalogue, effect_named
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS, Flight
@@ -396,3 +396,18 @@ def test_unusable_users_effect_is_told_in_one_line(tmp_path, text: str) -> None:
 def test_unknown_effect_is_told_with_the_nearest_name() -> None:
     with pytest.raises(InputError, match="rotor_drag"):
         effect_named("rotordrag")
+
+
+def test_a_number_is_the_vehicles_unless_it_is_of_the_day_the_place_or_the_sensor() -> None:
+    own = {(e.name, p.name) for e in catalogue().values() for p in e.parameters if p.belongs_to == FLIGHT}
+    assert own == {
+        ("wind", "x"),
+        ("wind", "y"),
+        *(("accelerometer_bias", axis) for axis in "xyz"),
+        ("ceiling_effect", "ceiling"),
+    }
+
+
+def test_whose_a_number_is_has_two_answers() -> None:
+    with pytest.raises(ValueError, match="'pull' belongs_to 'day'; it is VEHICLE or FLIGHT"):
+        Parameter("pull", "1", "pull", 0.0, 1.0, 0.0, 2.0, belongs_to="day")
