@@ -28,7 +28,7 @@ from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model, Term, linear_model
 
-LIBRARIES = ("trueflight", "numpy", "scipy", "statsmodels")
+LIBRARIES = ("trueflight", "numpy", "scipy")
 """What the figures depend on, besides the data."""
 
 

@@ -81,9 +81,8 @@ def rate_loop_sensitivity(flight: Flight, loop: RateLoop) -> tuple[np.ndarray, f
     Newey-West over `groundstation.identify.fitting.HAC_LAG` s, for the residual of rates is far from white.
     """
     from scipy import signal
-    from statsmodels.stats.sandwich_covariance import S_hac_simple
 
-    from trueflight.groundstation.identify.fitting import HAC_LAG, critical_value
+    from trueflight.groundstation.identify.fitting import HAC_LAG, bartlett_sum, critical_value
 
     bread, meat, seconds = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
     x = np.array([loop.lag, loop.delay, loop.integral])
@@ -106,7 +105,7 @@ def rate_loop_sensitivity(flight: Flight, loop: RateLoop) -> tuple[np.ndarray, f
         residual = signal.sosfiltfilt(sos, rate, axis=0)[skip::thin] - here
         bread += np.einsum("kap,kaq->pq", jacobian, jacobian)
         scores = np.einsum("kap,ka->kp", jacobian, residual)
-        meat += S_hac_simple(scores, nlags=max(1, round(HAC_LAG / (thin * dt))))
+        meat += bartlett_sum(scores, max(1, round(HAC_LAG / (thin * dt))))
         seconds += len(rate) * dt
     inverse = np.linalg.pinv(bread, hermitian=True)
     return inverse @ meat @ inverse, critical_value(seconds)

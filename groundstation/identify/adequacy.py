@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, signal, stats
+from scipy import ndimage, signal
 
 from trueflight.groundstation.identify.spectrum import own_period
 from trueflight.groundstation.measured.bins import bins
@@ -170,7 +170,8 @@ def _course(m: Measurement, column: np.ndarray, f: float) -> str:
     _, averaged = bins(m.t[m.used], max(1.0 / f, 1.0))
     course = averaged(envelope[:, None])[:, 0]
     # what is struck rises at once and dies slowly
-    struck = float(stats.skew(np.diff(course))) > 0.5
+    rises = np.diff(course)
+    struck = float(np.mean((rises - rises.mean()) ** 3)) > 0.5 * float(np.std(rises)) ** 3
     return ", it comes at once and dies away" if struck else ", it comes and goes"
 
 

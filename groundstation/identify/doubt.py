@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import ndimage, special
 
 from trueflight.groundstation.identify.fitting import Fit, variance_per_independent_sample
 from trueflight.groundstation.identify.search import Problem
@@ -147,7 +147,7 @@ class Weighing:
         values, vectors = np.linalg.eigh(apart)
         least = np.diag(vectors.T @ covariance @ vectors)
         along = (vectors.T @ step) ** 2 / np.maximum(values, 0.1 * least)
-        p_apart = float(stats.chi2.sf(along.sum(), len(own)))
+        p_apart = float(special.chdtrc(len(own), along.sum()))
         size = plain + step
         statistic = float(size @ np.linalg.pinv(covariance, hermitian=True) @ size)
         return Weighed(
@@ -158,7 +158,7 @@ class Weighing:
             self._shared(effect, own, plain),
             self._beside(own, plain),
             # the density of what is left is itself known from a few frequencies only
-            float(stats.f.sf(statistic / len(own), len(own), 2 * (2 * NARROWEST + 1))),
+            float(special.fdtrc(len(own), 2 * (2 * NARROWEST + 1), max(statistic, 0.0) / len(own))),
         )
 
     def _moved(self, own: list[int], step: np.ndarray, plain: np.ndarray) -> float:
@@ -178,7 +178,7 @@ class Weighing:
             gram, slope = flat.T @ flat, flat.T @ residual[part == p].ravel()
             gained += float(slope @ np.linalg.pinv(gram, hermitian=True) @ slope)
             done += float(plain @ gram @ plain)
-        chance = stats.chi2.isf(ALPHA, len(own) * (int(part.max()) + 1))
+        chance = special.chdtri(len(own) * (int(part.max()) + 1), ALPHA)
         unit = variance_per_independent_sample(self.problem, residual)
         return float(np.sqrt(gained / max(done, 1e-30))) if gained > chance * unit else 0.0
 

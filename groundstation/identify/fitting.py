@@ -16,8 +16,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy import optimize, stats
-from statsmodels.stats.sandwich_covariance import S_hac_simple
+from scipy import special
 
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.models.effect import Effect, Motion, Parameter, Stage
@@ -194,7 +193,7 @@ class Fit:
         difference = self.estimate[columns] - neutral
         covariance = self.covariance[np.ix_(columns, columns)]
         statistic = float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
-        return float(stats.chi2.sf(statistic * (1.96 / self.critical) ** 2, len(columns)))
+        return float(special.chdtrc(len(columns), max(statistic, 0.0) * (1.96 / self.critical) ** 2))
 
     def _neutral(self, index: int) -> float:
         """Value without effect; for a delay the nearest that the clock's tolerance allows."""
@@ -412,11 +411,19 @@ def robust_covariance(
         placed[m.used] = scores[offset : offset + int(m.used.sum())]
         period = float(np.median(np.diff(m.t)))
         if p:
-            meat += S_hac_simple(placed, nlags=max(1, round(HAC_LAG / period)))
+            meat += bartlett_sum(placed, max(1, round(HAC_LAG / period)))
         offset += int(m.used.sum())
         seconds += float(m.used.sum()) * period
     covariance = bread @ meat @ bread * (k / max(k - p, 1))
     return covariance, critical_value(seconds)
+
+
+def bartlett_sum(scores: np.ndarray, lags: int) -> np.ndarray:
+    """Newey-West's sum (P, P) over `scores` (N, P): their products at all distances up to `lags`, Bartlett weights
+    (Newey & West, Econometrica 55, 1987). Written as squares of sums over a window that is as long."""
+    sums = np.cumsum(np.pad(scores, ((lags + 1, lags), (0, 0))), axis=0)
+    windows = sums[lags + 1 :] - sums[: -lags - 1]
+    return np.asarray(windows.T @ windows) / (lags + 1)
 
 
 def variance_per_independent_sample(problem: Measured, residual: np.ndarray) -> float:
@@ -447,6 +454,8 @@ def with_clock(measurement: Measurement, chain: Chain) -> Chain:
     """
     if any(effect.shifts_clock for effect, _ in chain):
         return chain
+    from scipy import optimize  # dear to load
+
     problem = MeasuredFlights((measurement,))
     believed, period = problem.vehicle.command_delay, measurement.flight.dt
     measured = problem.measured()

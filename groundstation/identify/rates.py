@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from trueflight.groundstation.identify.actuation import RateLoop, fit_rate_loop, rate_loop_sensitivity
 from trueflight.groundstation.identify.search import FAMILY
@@ -56,7 +56,7 @@ def _judge_rates(effect: Effect, flight: Flight, later: float) -> tuple[EffectVe
     estimates = tuple(ParameterEstimate(n, v, *intervals[n], unit[n]) for n, v in values.items())
     granted = _granted(flight, later)
     spread = critical * float(np.sqrt(max(covariance[:2, :2].sum(), 0.0)))
-    p = float(stats.norm.sf((loop.lag + loop.delay - granted) / max(spread / 1.96, 1e-6)))
+    p = float(special.ndtr(-(loop.lag + loop.delay - granted) / max(spread / 1.96, 1e-6)))
     late = p < FAMILY
     verdict = EffectVerdict(
         effect.name,

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from trueflight.groundstation.identify.fitting import (
     Fit,
@@ -478,6 +478,6 @@ class Search:
     def _power(self, current: State, energy: float, choice: Choice) -> float:
         """Probability that the parameters are significant when what they change has this squared sum."""
         count = len(sizes(self.problem.effects[choice.effect], choice))
-        threshold = stats.chi2.isf(self.significance, count) * (current.fit.critical / 1.96) ** 2
+        threshold = special.chdtri(count, self.significance) * (current.fit.critical / 1.96) ** 2
         unit = variance_per_independent_sample(self.problem, current.fit.residual)
-        return float(stats.ncx2.sf(threshold, count, energy / unit))
+        return float(1.0 - special.chndtr(threshold, count, energy / unit))

@@ -12,7 +12,7 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from trueflight.groundstation.identify.fitting import BLOCK
 from trueflight.groundstation.identify.surrogates import BURST, random_phases, random_signs
@@ -144,7 +144,7 @@ def sparse_formula(measurement: Measurement, residual: np.ndarray) -> SparseForm
     if not chosen:
         return None
     estimates = _jackknife(library, residual, block, chosen)
-    factor = float(stats.t.ppf(0.975, max(int(block.max()), 1)))
+    factor = float(special.stdtrit(max(int(block.max()), 1), 0.975))
     terms = tuple(
         FormulaTerm(
             "xyz"[m.axes[a]], names[k], c, c - factor * s, c + factor * s, unit_of(names[k])

@@ -10,7 +10,7 @@ against its own neighbourhood in the same way.
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage, signal, stats
+from scipy import ndimage, signal, special
 
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.groundstation.results import SpectralLine
@@ -70,7 +70,7 @@ def _lines(
     # the median of an exponential variable is ln 2 of its mean
     noise = ndimage.median_filter(spectra, (1, width, 1), mode="nearest") / np.log(2.0)
     ratio = np.mean(spectra / np.maximum(noise, 1e-30), axis=0)
-    p = stats.gamma.sf(ratio * count, count) * inside.sum() * len(axes)
+    p = special.gammaincc(count, ratio * count) * inside.sum() * len(axes)
     power, floor = spectra.mean(axis=0), noise.mean(axis=0)
     found = []
     for column, axis in enumerate(axes):

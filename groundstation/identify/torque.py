@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import optimize
 
 from trueflight.groundstation.identify.fitting import (
     BLOCK,
@@ -118,6 +117,8 @@ def turning_of(flight: Flight) -> Turning | None:
 
 def _as_late_as_it_acts(motion: Motion, rotation: Rotation, inertia: np.ndarray) -> Motion:
     """Motor commands through the delay and lag with which their torque is best seen in the angular acceleration."""
+    from scipy import optimize  # dear to load
+
     speeds = np.sqrt(np.clip(motion.rotor_thrust, 0.0, None))
     dt = motion.dt
 

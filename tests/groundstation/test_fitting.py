@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy import signal
 from simulated import simulated
+from statsmodels.stats.sandwich_covariance import S_hac_simple
 
 from trueflight.groundstation.evaluate.compare import compare
 from trueflight.groundstation.evaluate.where import where_it_fails
-from trueflight.groundstation.identify.fitting import MeasuredFlights, critical_value, fit
+from trueflight.groundstation.identify.fitting import MeasuredFlights, bartlett_sum, critical_value, fit
 from trueflight.groundstation.measured.measurement import measure
 from trueflight.models.effect import Stage
 from trueflight.models.effects import catalogue
@@ -59,6 +60,12 @@ def test_intervals_of_drag_hold_the_truth(colour: float) -> None:
         inside += [low <= DRAG <= high for low, high in (fitted.interval(i) for i in fitted.of("rotor_drag"))]
     # 80 intervals; 95 % of them should hold it. Below 0.86 has a probability of 0.1 % if they do.
     assert np.mean(inside) >= 0.86
+
+
+@pytest.mark.parametrize("lags", [1, 7, 400])
+def test_newey_west_sum_is_that_of_statsmodels(lags: int) -> None:
+    scores = np.cumsum(np.random.default_rng(lags).normal(size=(500, 4)), axis=0)
+    assert bartlett_sum(scores, lags) == pytest.approx(S_hac_simple(scores, nlags=lags), rel=1e-9)
 
 
 def test_critical_value_is_the_normal_one_for_long_flights() -> None:
