@@ -11,13 +11,14 @@ asymptotic theory for heteroskedasticity-autocorrelation robust tests", Economet
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
 from scipy import special
 
+from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Value, Values, cut_at, held, number
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.models.effect import Effect, Motion, Parameter, Stage
 from trueflight.models.effects import CLOCK, effect_named
@@ -59,7 +60,8 @@ class Measured(Protocol):
 
 @dataclass(frozen=True)
 class FreeParameter:
-    """One free number of a fit: a parameter of an effect, its start and its bounds; `flat` where it has no prior."""
+    """One free number of a fit: a parameter of an effect, its start and its bounds, and the span in which it holds;
+    `flat` where it has no prior."""
 
     effect: str
     parameter: Parameter
@@ -70,6 +72,12 @@ class FreeParameter:
     tolerance: float = 0.0
     nuisance: bool = False
     flat: bool = False
+    span: Span = EVERYWHERE
+
+    @property
+    def number(self) -> tuple[str, str, Span]:
+        """What tells it from all others."""
+        return self.effect, self.parameter.name, self.span
 
     @property
     def spread(self) -> float:
@@ -97,13 +105,46 @@ class MeasuredFlights:
         """The vehicle of the flights."""
         return self.measurements[0].flight.vehicle
 
-    def predict(self, chain: Sequence[tuple[Effect, Mapping[str, float]]]) -> np.ndarray:
-        """Predicted specific force (K, A) of the used samples of all flights, behind each flight's filter."""
-        parts = []
-        for m, motion in zip(self.measurements, self.motions, strict=True):
-            force = m.see(specific_force(apply_effects(motion, [*chain, *self.always])))
-            parts.append(force[m.used][:, m.axes])
-        return np.concatenate(parts)
+    def predict(self, chain: Sequence[tuple[Effect, Values]]) -> np.ndarray:
+        """Predicted specific force (K, A) of the used samples of all flights, behind each flight's filter.
+
+        Numbers may differ between spans: a flight is put together from what each of its pieces says of it.
+        """
+        return self.predictor([effect for effect, _ in chain])([values for _, values in chain])
+
+    def predictor(self, effects: Sequence[Effect], keep: int = 0) -> Callable[[Sequence[Values]], np.ndarray]:
+        """`predict` as a function of the values of `effects`, for many calls: it keeps the last `keep` pieces, so that
+        a number is only predicted anew where it holds."""
+        names = [tuple(p.name for p in effect.parameters) for effect in effects]
+
+        def force(flight: int, key: tuple[tuple[float, ...], ...]) -> np.ndarray:
+            values = (dict(zip(n, k, strict=True)) for n, k in zip(names, key, strict=True))
+            return self.acting(flight, list(zip(effects, values, strict=True)))
+
+        piece = lru_cache(maxsize=keep)(force) if keep else force
+
+        def predicted(all_values: Sequence[Values]) -> np.ndarray:
+            parts = []
+            for flight, m in enumerate(self.measurements):
+                t = m.flight.t
+                pieces = []
+                for rows in cut_at(all_values, flight, t):
+                    here = [held(values, flight, float(t[rows.start])) for values in all_values]
+                    key = tuple(tuple(v[k] for k in n) for v, n in zip(here, names, strict=True))
+                    pieces.append(piece(flight, key)[rows])
+                whole = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+                parts.append(self.behind_filter(m, whole))
+            return np.concatenate(parts)
+
+        return predicted
+
+    def acting(self, flight: int, chain: Chain) -> np.ndarray:
+        """What the chain makes of all samples of flight number `flight`: specific force (N, 3), body axes, m/s²."""
+        return specific_force(apply_effects(self.motions[flight], [*chain, *self.always]))
+
+    def behind_filter(self, m: Measurement, acting: np.ndarray) -> np.ndarray:
+        """The used samples (K, A) of what acts, behind the flight's filter."""
+        return m.see(acting)[m.used][:, m.axes]
 
     @cached_property
     def motions(self) -> tuple[Motion, ...]:
@@ -142,8 +183,9 @@ class MeasuredFlights:
 class Fit:
     """A fitted chain.
 
-    `values` by effect and parameter; `free` the P fitted numbers, `estimate` (P,) theirs, `covariance` (P, P);
-    `jacobian` (K, A, P) and `residual` (K, A) at the optimum; `critical` the two-sided 95 % factor of `covariance`.
+    `terms` hold one value of each number, that of its last span, and `values` all of them; `free` the P fitted numbers,
+    `estimate` (P,) theirs, `covariance` (P, P); `jacobian` (K, A, P) and `residual` (K, A) at the optimum; `critical`
+    the two-sided 95 % factor of `covariance`.
     """
 
     terms: tuple[Term, ...]
@@ -153,6 +195,12 @@ class Fit:
     critical: float
     jacobian: np.ndarray
     residual: np.ndarray
+    spanned: Mapping[str, Values] = field(default_factory=dict)
+
+    @property
+    def values(self) -> dict[str, dict[str, Value]]:
+        """Values by effect and parameter, in the order of the chain; `Piecewise` where they differ between spans."""
+        return {t.effect: {**t.values, **self.spanned.get(t.effect, {})} for t in self.terms}
 
     @property
     def prior_penalty(self) -> float:
@@ -248,41 +296,52 @@ def fit(
     refit: Sequence[str] | None = None,
     clock: bool = True,
     tolerance: float = 1e-6,
-    pinned: Mapping[tuple[str, str], float] | None = None,
+    pinned: Mapping[tuple[str, str, Span], float] | None = None,
+    spans: Mapping[tuple[str, str], tuple[Span, ...]] | None = None,
 ) -> Fit:
     """Fit the parameters of `terms` (all of them, or the effects named in `refit`) to the flights.
 
     With `clock`, the delay between the columns is free within one sample of what the vehicle file says: no log's
-    clock is better than that, and a shift must not be taken for drag. `pinned` holds numbers, by effect and parameter,
-    where they are.
+    clock is better than that, and a shift must not be taken for drag. Each parameter that `spans` names, by effect and
+    parameter, is fitted once for each of its spans; outside of them it is without effect. `pinned` holds numbers, by
+    effect, parameter and span, where they are.
     """
-    vehicle, names = problem.vehicle, [t.effect for t in terms]
+    effects = {t.effect: effect_named(t.effect, problem.effects_directory) for t in terms}
     fixed = {t.effect: dict(t.values) for t in terms}
     free: list[FreeParameter] = []
     period = max(m.flight.dt for m in problem.measurements)
     for term in terms:
-        effect = effect_named(term.effect, problem.effects_directory)
+        effect = effects[term.effect]
         if (refit is None or term.effect in refit) and not effect.rotational:
             free += free_parameters(effect, problem.survey, term.values or None, period)
-    for (name, held), value in (pinned or {}).items():
-        fixed[name] = {**fixed.get(name, {}), held: value}
-    free = [f for f in free if (f.effect, f.parameter.name) not in (pinned or {})]
-    chain_names = list(names)
-    if clock and not any(effect_named(n, problem.effects_directory).shifts_clock for n in names):
-        (parameter,), believed = CLOCK.parameters, vehicle.command_delay
+    if clock and not any(effect.shifts_clock for effect in effects.values()):
+        (parameter,), believed = CLOCK.parameters, problem.vehicle.command_delay
         low, high = max(0.0, believed - period), believed + period
         free.append(
             FreeParameter(CLOCK.name, parameter, believed, low, high, believed, period, nuisance=True)
         )
-        chain_names.append(CLOCK.name)
-    effects = [effect_named(n, problem.effects_directory) for n in chain_names]
+        effects[CLOCK.name] = CLOCK
+    free = [
+        replace(f, span=span)
+        for f in free
+        for span in (spans or {}).get((f.effect, f.parameter.name), (EVERYWHERE,))
+    ]
+    numbers, pinned = [f.number for f in free], pinned or {}
+    neutral_of = {(f.effect, f.parameter.name): f.neutral for f in free}
+    free = [f for f in free if f.number not in pinned]
     measured = problem.measured()
+    predict = problem.predictor(list(effects.values()), _pieces(problem, numbers))
+
+    def all_values(x: np.ndarray) -> dict[str, dict[str, Value]]:
+        fitted = {**pinned, **{f.number: float(value) for f, value in zip(free, x, strict=True)}}
+        values: dict[str, dict[str, Value]] = {name: dict(fixed.get(name, {})) for name in effects}
+        for (name, parameter), neutral in neutral_of.items():
+            parts = [(n[2], fitted[n]) for n in numbers if n[:2] == (name, parameter)]
+            values[name][parameter] = number(parts, neutral)
+        return values
 
     def residual(x: np.ndarray) -> np.ndarray:
-        values = {name: dict(fixed.get(name, {})) for name in chain_names}
-        for f, value in zip(free, x, strict=True):
-            values[f.effect][f.parameter.name] = float(value)
-        return (measured - problem.predict([(e, values[e.name]) for e in effects])).ravel()
+        return (measured - predict(list(all_values(x).values()))).ravel()
 
     weight = np.sqrt(problem.unit()) / np.array([f.spread for f in free])
     neutral = np.array([f.neutral for f in free])
@@ -293,17 +352,27 @@ def fit(
     k, a = measured.shape
     shaped = jacobian.reshape(k, a, len(free))
     covariance, critical = robust_covariance(problem, shaped, flat.reshape(k, a), weight)
-    values = {name: dict(fixed.get(name, {})) for name in chain_names}
-    intervals: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in chain_names}
+    last = {name: dict(fixed.get(name, {})) for name in effects}
+    for n, value in pinned.items():
+        last[n[0]][n[1]] = value
+    intervals: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in effects}
     for i, f in enumerate(free):
         half = half_width(f, float(estimate[i]), covariance[i, i], critical)
-        values[f.effect][f.parameter.name] = float(estimate[i])
+        last[f.effect][f.parameter.name] = float(estimate[i])
         intervals[f.effect][f.parameter.name] = (float(estimate[i] - half), float(estimate[i] + half))
     fitted = tuple(
-        Term(name, values[name], intervals[name] or (terms[i].intervals if i < len(terms) else {}))
-        for i, name in enumerate(chain_names)
+        Term(name, last[name], intervals[name] or (terms[i].intervals if i < len(terms) else {}))
+        for i, name in enumerate(effects)
     )
-    return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a))
+    spanned = all_values(estimate) if any(n[2] != EVERYWHERE for n in numbers) else {}
+    return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a), spanned)
+
+
+def _pieces(problem: MeasuredFlights, numbers: Sequence[tuple[str, str, Span]]) -> int:
+    """How many predictions of pieces are worth keeping: those of the point at which one number after the other is
+    moved, and as many on the way to the next; none where every number holds everywhere."""
+    spans = {n[2] for n in numbers} - {EVERYWHERE}
+    return 4 * (len(problem.measurements) + 2 * len(spans)) if spans else 0
 
 
 def _minimise(

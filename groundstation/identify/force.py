@@ -17,6 +17,7 @@ from trueflight.groundstation.identify.fitting import (
     with_clock,
 )
 from trueflight.groundstation.identify.search import Choice, State, evidence, sizes, whole
+from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Values, number
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.models.effect import Effect, Stage
 from trueflight.models.effects import catalogue
@@ -118,12 +119,29 @@ class ForceProblem:
         free = (*self.beside_all, *added)
         terms = [*self.base.terms, *self.turning, *(Term(n, start.get(n, {})) for n in free)]
         terms = self._placed(terms, added)
-        fitted = fit(self.flights, terms, refit=free)
+        spans = self._spans(choices)
+        fitted = fit(self.flights, terms, refit=free, spans=spans)
         if through := [n for n in added if self.effects[n].acts_through]:
             # what acts through another can balance it far from the best fit: begin once more from "none of it"
-            other = fit(self.flights, self._anew(terms, through), refit=free)
+            other = fit(self.flights, self._anew(terms, through), refit=free, spans=spans)
             fitted = other if evidence(self, other, fitted) > 0.0 else fitted
         return fitted
+
+    def _spans(self, choices: Sequence[Choice]) -> dict[tuple[str, str], tuple[Span, ...]]:
+        """The spans of every number that holds not everywhere, by effect and parameter; where an effect acts does not
+        differ between them."""
+        return {
+            (c.effect, p.name): c.spans for c in choices if c.spans for p in sizes(self.effects[c.effect], c)
+        }
+
+    def spans_of(self, here: Fit) -> dict[tuple[str, str], tuple[Span, ...]]:
+        """The spans of the numbers of a fit, to fit them again."""
+        found: dict[tuple[str, str], tuple[Span, ...]] = {}
+        for f in here.free:
+            if f.span != EVERYWHERE:
+                key = (f.effect, f.parameter.name)
+                found[key] = (*found.get(key, ()), f.span)
+        return found
 
     def _anew(self, terms: list[Term], through: Sequence[str]) -> list[Term]:
         """`terms` with the effects `through` at none of it, and those that they act through at their typical size."""
@@ -162,19 +180,22 @@ class ForceProblem:
         return max(self._gain_at(here, step, place) for place in ({}, *places))
 
     def _gain_at(self, here: Fit, step: tuple[Choice, ...], place: Mapping[str, float]) -> float:
-        values = {t.effect: dict(t.values) for t in here.terms}
-        chain = [(self.effects[n], v) for n, v in values.items()]
+        values = here.values
+        chain: list[tuple[Effect, Values]] = [(self.effects[n], v) for n, v in values.items()]
         base = self.flights.measured() - here.residual
         columns = []
         for choice in step:
             effect = self.effects[choice.effect]
             at = {p.name: place[p.name] for p in effect.parameters if p.structural and p.name in place}
-            neutral = dict(values.get(effect.name, self.at_rest(effect))) | at
+            none = self.at_rest(effect) | at
+            present = values.get(effect.name, none) | at
             rest = [(e, v) for e, v in chain if e.name != effect.name]
             for p in sizes(effect):
-                moved = {**neutral, p.name: p.typical if p.typical != neutral[p.name] else p.typical * 1.5}
-                prediction = self.flights.predict([*rest, (effect, moved)])
-                columns.append((prediction - base).ravel())
+                to = p.typical if p.typical != present[p.name] else p.typical * 1.5
+                for span in choice.spans or (EVERYWHERE,):
+                    moved = {**present, p.name: number([(span, to)], none[p.name])}
+                    prediction = self.flights.predict([*rest, (effect, moved)])
+                    columns.append((prediction - base).ravel())
             chain = [*rest, (effect, effect.typical(self.flights.survey) | at)]
             base = self.flights.predict(chain) if len(step) > 1 else base
         matrix = np.column_stack([here.jacobian.reshape(self.samples, -1), *columns])
@@ -185,15 +206,20 @@ class ForceProblem:
         return float(residual @ matrix @ solution)
 
     def contribution(self, here: Fit, choice: Choice, through: str | None = None) -> np.ndarray:
-        """What the effect at its typical size changes in the predicted specific force, (K A, P): one column each."""
-        values = {t.effect: dict(t.values) for t in here.terms}
+        """What the effect at its typical size changes in the predicted specific force, (K A, P): one column for each
+        number, in each of its spans."""
+        values: dict[str, Values] = dict(here.values)
         effect = self.effects[choice.effect]
         if through is not None:
             values[through] = self.effects[through].typical(self.flights.survey)
         rest = [(self.effects[n], v) for n, v in values.items() if n != effect.name]
         neutral = self.at_rest(effect)
         base = self.flights.predict([*rest, (effect, neutral)])
-        moved = ({**neutral, p.name: p.typical} for p in sizes(effect))
+        moved = (
+            {**neutral, p.name: number([(span, p.typical)], neutral[p.name])}
+            for p in sizes(effect)
+            for span in choice.spans or (EVERYWHERE,)
+        )
         return np.column_stack([(self.flights.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
 
     def adequate(self, here: Fit) -> bool:
@@ -216,7 +242,12 @@ class ForceProblem:
         if effect.stage is Stage.COMMAND or any(p.even for p in effect.parameters):
             return None
         rest = self.at_rest(effect)
-        own = [f for f in free_parameters(effect, self.flights.survey) if not f.parameter.structural]
+        own = [
+            replace(f, span=span)
+            for f in free_parameters(effect, self.flights.survey)
+            if not f.parameter.structural
+            for span in choice.spans or (EVERYWHERE,)
+        ]
         free = (*here.free, *own)
         scale = np.array([f.parameter.typical - rest[f.parameter.name] for f in own])
         columns = -self.contribution(here, choice) / scale
@@ -228,7 +259,7 @@ class ForceProblem:
         step = -np.linalg.solve(flat.T @ flat + np.diag(weight**2), flat.T @ here.residual.ravel() + pull)
         residual = here.residual + jacobian @ step
         covariance, critical = robust_covariance(self.flights, jacobian, residual, weight)
-        return Fit(here.terms, free, start + step, covariance, critical, jacobian, residual)
+        return Fit(here.terms, free, start + step, covariance, critical, jacobian, residual, here.spanned)
 
     # --- what is enough -------------------------------------------------------------------------------------
 
@@ -245,7 +276,7 @@ class ForceProblem:
         """Squared error on the held-out flight, (m/s²)²."""
         if self.held_out is None:
             return None
-        chain = [(self.effects[t.effect], t.values) for t in fitted.terms]
+        chain = [(self.effects[t.effect], t.values) for t in fitted.terms]  # as it was at the end
         return float(np.sum((self.held_out.measured() - self.held_out.predict(chain)) ** 2))
 
 

@@ -145,7 +145,7 @@ def _cost(problem: ForceProblem, here: Fit, i: int, at: float, unit: float) -> f
     terms = [t for t in here.terms if t.effect not in nuisance]
     free = here.free[i]
     fitted = tuple({f.effect for f in here.free if not f.nuisance})
-    held = fit(problem.flights, terms, refit=fitted, pinned={(free.effect, free.parameter.name): at})
+    held = fit(problem.flights, terms, refit=fitted, pinned={free.number: at}, spans=problem.spans_of(here))
     return max((held.sse - here.sse) / unit, 0.0)
 
 

@@ -7,17 +7,16 @@ and without the air, and what is found there starts the search in the accelerati
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from trueflight.groundstation.identify.fitting import HAC_LAG, UNMODELLED, MeasuredFlights
-from trueflight.models.effect import Effect
+from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
-from trueflight.models.prediction import apply_effects, motion_of_flight
+from trueflight.models.prediction import Chain, apply_effects, motion_of_flight
 
 NEAR_HOVER = (0.8, 1.2)
 """Thrust over hover thrust at which the believed curve is trusted to calibrate the rotors."""
@@ -27,13 +26,14 @@ NEAR_HOVER = (0.8, 1.2)
 class MeasuredRotors(MeasuredFlights):
     """Flights whose measured side is the specific thrust that the squares of the rotor speeds are proportional to."""
 
-    def predict(self, chain: Sequence[tuple[Effect, dict[str, float]]]) -> np.ndarray:  # type: ignore[override]
-        """Specific thrust (K, 1), m/s², that the chain makes of the command."""
-        parts = []
-        for m, motion in zip(self.measurements, self.motions, strict=True):
-            level = motion.with_(rotor_thrust=None, torque=None)
-            parts.append(m.smooth(np.asarray(apply_effects(level, chain).thrust)[:, None])[m.used])
-        return np.concatenate(parts)
+    def acting(self, flight: int, chain: Chain) -> np.ndarray:
+        """Specific thrust (N, 1), m/s², that the chain makes of the command of flight number `flight`."""
+        level = self.motions[flight].with_(rotor_thrust=None, torque=None)
+        return np.asarray(apply_effects(level, chain).thrust)[:, None]
+
+    def behind_filter(self, m: Measurement, acting: np.ndarray) -> np.ndarray:
+        """The used samples (K, 1) of the thrust, behind the flight's filter."""
+        return m.smooth(acting)[m.used]
 
     def measured(self) -> np.ndarray:
         """Specific thrust (K, 1), m/s², of the rotor speeds, scaled to the command's."""

@@ -28,6 +28,7 @@ from trueflight.groundstation.identify.fitting import (
     block_errors,
     variance_per_independent_sample,
 )
+from trueflight.groundstation.identify.spans import Span
 from trueflight.models.effect import Effect, Parameter
 
 FAMILY = 0.01
@@ -52,10 +53,11 @@ SETS = 3
 @dataclass(frozen=True, order=True)
 class Choice:
     """An effect as a candidate, with the names of those of its parameters that act: all of them, or the one of an
-    `exclusive` effect."""
+    `exclusive` effect. With `spans`, it has a size of its own in each of them, and none outside."""
 
     effect: str
     parameters: tuple[str, ...]
+    spans: tuple[Span, ...] = ()
 
 
 def whole(effect: Effect) -> Choice:
