@@ -3,35 +3,78 @@
 from __future__ import annotations
 
 import os
+import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import lz4.frame
 import zstandard
+from mcap.opcode import Opcode
 from mcap.records import Chunk, McapRecord
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+Chunks = Literal["apart", "whole", "not"]
+_HEAD = struct.Struct("<BQH")
+"""Opcode and length of a record, and the channel that a message begins with."""
+_OF_MESSAGE = 22
+"""Bytes of a message before its data: channel, sequence and two times."""
 MOST_IN_CHUNK = 256 << 20
 """Bytes of one chunk when unpacked; writers make chunks of some hundred kilobytes to a few megabytes."""
 
 
-def mcap_records(stream: BinaryIO, damaged: list[str]) -> Iterator[McapRecord]:
-    """Every record that is whole; a chunk that is not is skipped and noted in `damaged`.
+def mcap_records(stream: BinaryIO, damaged: list[str], chunks: Chunks = "apart") -> Iterator[McapRecord]:
+    """Every record that is whole; a chunk that is not is skipped and noted in `damaged`. `chunks` come
+    taken "apart", "whole" and uncompressed (`parts` tells what is in one), or "not" at all.
 
     Raises what `mcap` does where the file itself cannot be followed further: see `models.outside.unreadable`.
     """
     bounded: Any = _Bounded(stream)
-    for record in StreamReader(bounded, emit_chunks=True, record_size_limit=bounded.size).records:
+    for record in _Reader(bounded, chunks, bounded.size).records:
         if not isinstance(record, Chunk):
             yield record
             continue
         try:
-            parts = breakup_chunk(_unpacked(record), validate_crc=True)
+            unpacked = _unpacked(record)
+            whole = breakup_chunk(unpacked, validate_crc=True) if chunks == "apart" else [_checked(unpacked)]
         except Exception as error:  # noqa: BLE001 - each decompressor raises its own kind
             damaged.append(" ".join(str(error).split()) or type(error).__name__)
             continue
-        yield from parts
+        yield from whole
+
+
+def _checked(chunk: Chunk) -> Chunk:
+    if chunk.uncompressed_crc and zlib.crc32(chunk.data) != chunk.uncompressed_crc:
+        raise ValueError("a chunk's checksum is wrong")
+    return chunk
+
+
+def parts(chunk: Chunk) -> list[tuple[int, int, int, int]]:
+    """Opcode, channel (of messages), and where the content begins and ends, of each record of an uncompressed chunk:
+    of a message its data alone. Raises `ValueError` where a record reaches beyond the chunk."""
+    data, at, found, message = chunk.data, 0, [], int(Opcode.MESSAGE)
+    size, head = len(data), _HEAD.unpack_from
+    while at < size:
+        if at + _HEAD.size > size:
+            raise ValueError("a chunk ends inside a record")
+        opcode, length, channel = head(data, at)
+        start, at = at + 9, at + 9 + length
+        if at > size or (opcode == message and length < _OF_MESSAGE):
+            raise ValueError("a record reaches beyond its chunk")
+        found.append((opcode, channel, start + _OF_MESSAGE if opcode == message else start, at))
+    return found
+
+
+class _Reader(StreamReader):
+    """Passes over where messages stand in a chunk: nobody asks here, and it takes longer than to read them."""
+
+    def __init__(self, stream: Any, chunks: Chunks, size: int) -> None:
+        super().__init__(stream, emit_chunks=True, record_size_limit=size)
+        self._passed = {Opcode.MESSAGE_INDEX, *([Opcode.CHUNK] if chunks == "not" else [])}
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        return None if opcode in self._passed else super()._read_record(opcode, length)
 
 
 class _Bounded:

@@ -8,12 +8,12 @@ specification, https://mcap.dev/spec.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import queue
 import struct
 import threading
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -21,14 +21,17 @@ from typing import BinaryIO
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, InvalidMagic
-from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from trueflight.models.design import Design, design_from_json, design_to_json
 from trueflight.models.errors import InputError
-from trueflight.models.mcap_records import mcap_records
+from trueflight.models.mcap_records import mcap_records, parts
 from trueflight.models.outside import toml_table, unreadable
+from trueflight.models.record_columns import TickColumns
 from trueflight.models.record_pb2 import DESCRIPTOR, Event, Tick
 from trueflight.models.vehicle import Vehicle, vehicle_from_table
 
@@ -292,23 +295,25 @@ class FlightRecord:
     notes: tuple[str, ...] = ()
 
 
-def read_record(path: str | Path) -> FlightRecord:
-    """Read a flight record, also one that a power cut left without its end.
+def read_record(path: str | Path, ticks: bool = True) -> FlightRecord:
+    """Read a flight record, also one that a power cut left without its end; without its `ticks` and events where only
+    what stands before and behind them is asked for.
 
     Raises `InputError` for a file that cannot be read, is no MCAP, or holds no tick.
     """
     path = Path(path)
-    raw = _Raw()
     with unreadable(path, "the flight record", _OURS), path.open("rb") as stream:
-        end = _read_all(stream, raw)
-    if not raw.ticks:
-        if end == _NO_MCAP:
-            raise InputError(f"{path}: {end}; {_OURS}")
+        raw = _Raw(TickColumns(os.fstat(stream.fileno()).st_size))
+        end = _read_all(stream, raw, ticks)
+    if end == _NO_MCAP:
+        raise InputError(f"{path}: {end}; {_OURS}")
+    if ticks and not raw.ticks.count:
         what = "other topics only" if raw.foreign else "no tick"
         raise InputError(f"{path}: holds {what}{'' if end is None else f' ({end})'}; nothing was flown in it")
     notes = []
     if end is not None:
-        notes.append(f"the file is not whole ({end}); {len(raw.ticks)} ticks were recovered")
+        recovered = f"; {raw.ticks.count} ticks were recovered" if ticks else ""
+        notes.append(f"the file is not whole ({end}){recovered}")
     if (dropped := raw.metadata.get("dropped", "0")) != "0":
         notes.append(f"{dropped[:20]} messages were dropped while recording: the disk was too slow")
     vehicle = design = None
@@ -327,7 +332,7 @@ def read_record(path: str | Path) -> FlightRecord:
         except InputError as error:
             notes.append(f"its design file is damaged: {error}")
     with unreadable(path, "the flight record", _OURS):
-        columns = tick_columns(raw.ticks)
+        columns = raw.ticks.columns() if ticks else {}
     return FlightRecord(
         str(path), columns, tuple(raw.events), raw.metadata, vehicle, design, end is not None, tuple(notes)
     )  # fmt: skip
@@ -346,32 +351,45 @@ def _text(attachment: bytes, where: str) -> str:
 
 @dataclass
 class _Raw:
-    ticks: list[Tick] = field(default_factory=list)
+    ticks: TickColumns
     events: list[Event] = field(default_factory=list)
     metadata: dict[str, str] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     foreign: bool = False
 
 
-def _read_all(stream: BinaryIO, raw: _Raw) -> str | None:
+def _read_all(stream: BinaryIO, raw: _Raw, ticks: bool) -> str | None:
     """Collect every record; returns None for a proper end, otherwise how the file ended."""
-    schemas: dict[int, str] = {}
-    channels: dict[int, str] = {}
     damaged: list[str] = []
+    end = _collect(stream, raw, damaged, ticks)
+    try:
+        raw.ticks.settle()
+    except Exception as error:  # noqa: BLE001 - of a damaged file every library raises its own kind
+        return f"damaged after {raw.ticks.count} ticks: {error}"
+    return end or (f"{len(damaged)} damaged chunks" if damaged else None)
+
+
+def _collect(stream: BinaryIO, raw: _Raw, damaged: list[str], ticks: bool) -> str | None:
+    kinds = _Kinds()
     begun = False
     try:
-        for record in mcap_records(stream, damaged):
+        for record in mcap_records(stream, damaged, "whole" if ticks else "not"):
             begun = True
             if isinstance(record, Metadata):
                 raw.metadata.update(record.metadata)
             elif isinstance(record, Attachment):
                 raw.attachments[record.name] = record.data
-            elif isinstance(record, Schema):
-                schemas[record.id] = record.name
-            elif isinstance(record, Channel):
-                channels[record.id] = schemas.get(record.schema_id, "")
+            elif isinstance(record, Schema | Channel):
+                kinds.note(record)
             elif isinstance(record, Message):
-                _take(record, channels.get(record.channel_id, ""), raw)
+                _take(memoryview(record.data), kinds.of(record.channel_id), raw)
+            elif isinstance(record, Chunk):
+                try:
+                    whole = parts(record)
+                except ValueError as error:
+                    damaged.append(str(error))
+                    continue
+                _take_chunk(record, whole, kinds, raw)
     except EndOfFile:
         return "cut off inside a chunk" if begun else _NO_MCAP
     except (InvalidMagic, struct.error):
@@ -379,92 +397,52 @@ def _read_all(stream: BinaryIO, raw: _Raw) -> str | None:
     except OSError:
         raise
     except Exception as error:  # noqa: BLE001 - of a damaged file every library raises its own kind
-        return f"damaged after {len(raw.ticks)} ticks: {error}"
-    return f"{len(damaged)} damaged chunks" if damaged else None
+        return f"damaged after {raw.ticks.count} ticks: {error}"
+    return None
 
 
-def _take(message: Message, kind: str, raw: _Raw) -> None:
+@dataclass
+class _Kinds:
+    """What messages the channels of a file carry."""
+
+    schemas: dict[int, str] = field(default_factory=dict)
+    channels: dict[int, str] = field(default_factory=dict)
+
+    def note(self, record: Schema | Channel) -> None:
+        """Remember a schema or a channel."""
+        if isinstance(record, Schema):
+            self.schemas[record.id] = record.name
+        else:
+            self.channels[record.id] = self.schemas.get(record.schema_id, "")
+
+    def of(self, channel: int) -> str:
+        """Name of the messages of a channel; empty where it was never told."""
+        return self.channels.get(channel, "")
+
+    def channels_of(self, kind: str) -> set[int]:
+        """The channels that carry messages of a kind."""
+        return {number for number, carried in self.channels.items() if carried == kind}
+
+
+def _take_chunk(chunk: Chunk, records: list[tuple[int, int, int, int]], kinds: _Kinds, raw: _Raw) -> None:
+    """Collect what is in a chunk."""
+    data = memoryview(chunk.data)
+    for opcode, _, start, stop in records:
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            content = ReadDataStream(io.BytesIO(data[start:stop]))
+            kinds.note(Schema.read(content) if opcode == Opcode.SCHEMA else Channel.read(content))
+    ticks = kinds.channels_of(Tick.DESCRIPTOR.full_name)
+    message = int(Opcode.MESSAGE)
+    raw.ticks.add([data[a:b] for opcode, channel, a, b in records if opcode == message and channel in ticks])
+    for opcode, channel, start, stop in records:
+        if opcode == message and channel not in ticks:
+            _take(data[start:stop], kinds.of(channel), raw)
+
+
+def _take(message: memoryview, kind: str, raw: _Raw) -> None:
     if kind == Tick.DESCRIPTOR.full_name:
-        raw.ticks.append(Tick.FromString(message.data))
+        raw.ticks.add([message])
     elif kind == Event.DESCRIPTOR.full_name:
-        raw.events.append(Event.FromString(message.data))
+        raw.events.append(Event.FromString(bytes(message)))
     else:
         raw.foreign = True
-
-
-_SCALARS = {
-    "thrust_command": float,
-    "battery_voltage": float,
-    "yaw_reference": float,
-    "interval": float,
-    "latency": float,
-    "age": float,
-    "overtaken": int,
-    "inference": float,
-    "setpoint_sent": bool,
-    "armed": bool,
-    "model": str,
-    "controller": str,
-    "flight_mode": str,
-    "phase": str,
-    "guard": str,
-    "trajectory": str,
-    "shadow": str,
-}
-_VECTORS = (
-    "position",
-    "velocity",
-    "angular_velocity",
-    "specific_force",
-    "position_reference",
-    "velocity_reference",
-    "acceleration_reference",
-    "correction",
-    "correction_raw",
-    "body_rate_command",
-    "shadow_raw",
-    "trim",
-)
-
-
-def tick_columns(ticks: Iterable[Tick]) -> dict[str, np.ndarray]:
-    """Columns of `ticks` (N), each (N,) or (N, k), as described in `FlightRecord`."""
-    ticks = list(ticks)
-    columns: dict[str, np.ndarray] = {}
-    for name, kind in _SCALARS.items():
-        columns[name] = np.array([getattr(tick, name) for tick in ticks], dtype=kind)
-    for name in _VECTORS:
-        columns[name] = np.array([_vector(tick, name) for tick in ticks], dtype=float).reshape(-1, 3)
-    columns["quaternion"] = np.array(
-        [(t.quaternion.w, t.quaternion.x, t.quaternion.y, t.quaternion.z) for t in ticks], dtype=float
-    ).reshape(-1, 4)
-    columns["feedback_thrust"] = np.array([tick.feedback.thrust for tick in ticks], dtype=float)
-    columns["feedback_body_rate"] = np.array(
-        [(t.feedback.body_rate.x, t.feedback.body_rate.y, t.feedback.body_rate.z) for t in ticks], dtype=float
-    ).reshape(-1, 3)
-    columns["rotor_speed"] = np.array(
-        [tuple(t.rotor_speed)[:4] if len(t.rotor_speed) >= 4 else (np.nan,) * 4 for t in ticks], dtype=float
-    ).reshape(-1, 4)
-    columns["battery_voltage"][columns["battery_voltage"] == 0.0] = np.nan
-    for name in (
-        "specific_force",
-        "rotor_speed",
-        "battery_voltage",
-        "position_reference",
-        "shadow_raw",
-        "trim",
-    ):
-        if not np.any(np.isfinite(columns[name])):
-            del columns[name]
-    vehicle_time = np.array([tick.vehicle_time_us for tick in ticks], dtype=np.int64)
-    columns["vehicle_time"] = vehicle_time * 1e-6
-    columns["host_time"] = np.array([tick.host_time_ns for tick in ticks], dtype=np.int64) * 1e-9
-    columns["t"] = (vehicle_time - vehicle_time[:1]) * 1e-6
-    return columns
-
-
-def _vector(tick: Tick, name: str) -> tuple[float, float, float]:
-    if not tick.HasField(name):
-        return (np.nan, np.nan, np.nan)
-    vector = getattr(tick, name)
-    return (vector.x, vector.y, vector.z)

@@ -58,7 +58,7 @@ def read_designed(
     if path.suffix.lower() == ".mcap" and not is_ros_bag(path):
         from trueflight.models.record import read_record
 
-        record = read_record(path)
+        record = read_record(path, ticks=False)
         controller = record.metadata.get("controller", "")
         label = f"{record.metadata.get('trajectory', path.stem)} {controller}".strip()
         if design is None and record.design is not None:

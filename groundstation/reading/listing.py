@@ -53,7 +53,7 @@ def flight_row(file: Path, directory: Path) -> dict[str, Any]:
 
 
 def _record_facts(file: Path) -> dict[str, Any]:
-    record = read_record(file)
+    record = read_record(file, ticks=False)
     facts = {name: record.metadata.get(name, "") for name in ("trajectory", "controller", "model")}
     created = record.metadata.get("created_ns", "")
     if created.isdecimal() and len(created) < 20:

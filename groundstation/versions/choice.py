@@ -88,7 +88,7 @@ def choose_design(flight: Flight, given: str | Path | None = None) -> Design | N
     record = Path(flight.origin)
     if record.suffix.lower() != ".mcap" or is_ros_bag(record):
         return None
-    return read_record(record).design
+    return read_record(record, ticks=False).design
 
 
 def design_to_fly(vehicle: Vehicle, flight: Flight | None = None, given: str | Path | None = None) -> Design:
