@@ -16,6 +16,7 @@ import typer
 from trueflight.companion import onboard_commands
 from trueflight.models.errors import InputError, run_command_line
 from trueflight.models.printed import print_json_line
+from trueflight.models.program import offer_version
 
 if TYPE_CHECKING:
     from trueflight.companion.app import Companion
@@ -24,7 +25,6 @@ app = typer.Typer(
     name="companion",
     help="Runs on the vehicle: flies missions over MAVLink, records them, and answers the ground over Zenoh.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
@@ -252,11 +252,12 @@ def trajectories(as_json: Json = False) -> None:
 
 
 onboard_commands.register(app)
+offer_version(app, "companion")
 
 
 def main() -> None:
     """Entry point: bad input becomes one line and exit code 2."""
-    run_command_line(app)
+    run_command_line(app, "companion")
 
 
 if __name__ == "__main__":

@@ -31,11 +31,11 @@ def shown(value: object, most: int = 60) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
-def run_command_line(app: Callable[[], object]) -> None:
+def run_command_line(app: Callable[[], object], extra: str = "all") -> None:
     """Run a typer application; an `InputError` becomes one line on standard error and exit code 2.
 
-    So does a disk that is full, whatever was being written, and a terminal that cannot show a character shows the
-    nearest that it can.
+    So do a disk that is full, whatever was being written, and a library that is not installed, for which `extra` of
+    the package is named. A terminal that cannot show a character shows the nearest that it can.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -44,6 +44,11 @@ def run_command_line(app: Callable[[], object]) -> None:
         app()
     except InputError as error:
         _end(str(error))
+    except ModuleNotFoundError as error:
+        library = (error.name or "").split(".")[0]
+        if library in ("", "trueflight"):
+            raise
+        _end(f"{library} is not installed here; pip install 'trueflight[{extra}]'")
     except BrokenPipeError:  # whoever read the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         raise SystemExit(1) from None

@@ -5,12 +5,12 @@ from __future__ import annotations
 import typer
 
 from trueflight.models.errors import run_command_line
+from trueflight.models.program import offer_version
 from trueflight.sim_bridge.commands import answers, collect, fly, run, sitl
 
 app = typer.Typer(
     name="sim-bridge",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="A simulated vehicle that behaves as a PX4 would, with physical effects to hide in it.",
@@ -20,8 +20,9 @@ sitl.register(app)
 fly.register(app)
 collect.register(app)
 answers.register(app)
+offer_version(app, "sim-bridge")
 
 
 def main() -> None:
     """Entry point of `sim-bridge`."""
-    run_command_line(app)
+    run_command_line(app, "sim")

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -113,3 +114,20 @@ def _free(kind: socket.SocketKind) -> int:
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+@contextmanager
+def told_to_end() -> Iterator[threading.Event]:
+    """An event that is set once this process is told to end: by Ctrl-C, SIGTERM or the end of its terminal. A program
+    in a shell's background, where Ctrl-C is ignored, is told by SIGINT too."""
+    told = threading.Event()
+    if threading.current_thread() is not threading.main_thread():  # only there may a handler be set
+        yield told
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, lambda *_: told.set()) for number in numbers}
+    try:
+        yield told
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

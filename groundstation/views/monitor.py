@@ -14,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from trueflight.groundstation.operate.link import Link
+from trueflight.groundstation.operate.processes import told_to_end
 from trueflight.groundstation.views import scene
 from trueflight.groundstation.views.colour import AXES, LINEAR, MEASURED, NEWEST, REFERENCE, WARNING, Colour
 from trueflight.groundstation.views.recording import TIME, recording, text
@@ -56,8 +57,8 @@ CURVES: tuple[tuple[str, str, Colour], ...] = (
 
 
 def monitor(link: Link, save: Path | None = None, seconds: float | None = None) -> int:
-    """Show a companion's ticks and events until interrupted, or for `seconds`; returns how many ticks were
-    seen.
+    """Show a companion's ticks and events until told to end (Ctrl-C, SIGTERM, a closed terminal), or for `seconds`;
+    returns how many ticks were seen.
 
     Opens the Rerun viewer, or writes the recording `save`. Raises `InputError` where there is no viewer to
     open.
@@ -97,23 +98,20 @@ class Monitor:
         scene.log_vehicle(stream, "space/vehicle", drawn, 5.0)
 
     def run(self, link: Link, seconds: float | None = None) -> int:
-        """Follow `link` until interrupted or for `seconds`; returns how many ticks were seen."""
+        """Follow `link` until told to end or for `seconds`; returns how many ticks were seen."""
         if link.warning:
             self.stream.log("events", rr.TextLog(link.warning, level="ERROR"), static=False)
         link.follow(self._ticks.put, self._events.put, history=HISTORY)
         end = time.monotonic() + seconds if seconds is not None else np.inf
         asked = -np.inf
-        try:
-            while time.monotonic() < end:
-                time.sleep(PERIOD)
+        with told_to_end() as told:
+            while time.monotonic() < end and not told.wait(PERIOD):
                 if time.monotonic() - asked > ASK and time.monotonic() - self._heard < SILENCE:
                     asked = time.monotonic()
                     with contextlib.suppress(InputError):  # the link may drop; ticks say the rest
                         self._models = link.ask("status", timeout=ASK)
                         self._models["insecure"] = link.warning
                 self.update()
-        except KeyboardInterrupt:
-            pass
         self.update()
         return self.seen
 

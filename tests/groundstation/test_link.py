@@ -260,19 +260,27 @@ def test_a_flight_is_asked_for_watched_fetched_and_tracked(processes, endpoint, 
         return told.stdout
 
     assert valid("groundstation status", json.loads(ground("status", "-e", endpoint, "--json")))["ready"]
+    # as a shell starts it in the background: Ctrl-C ignored
     watch = subprocess.Popen(
-        [program, "monitor", "-e", endpoint, "--save", recording, "--seconds", "6"],
+        ["sh", "-c", f"{program} monitor -e {endpoint} --save {recording} & echo $!; wait"],
         env=environment,
         stdout=subprocess.PIPE,
+        text=True,
         preexec_fn=with_parent,
     )
+    watching = int(watch.stdout.readline())
     flown = json.loads(
         ground(
             "fly", "hover", "--set", "duration=4", "-e", endpoint, "--wait", "-o", tmp_path / "got", "--json"
         )
     )
     assert flown["state"] == "finished"
-    assert watch.wait(60) == 0 and recording.stat().st_size > 10_000
+    os.kill(watching, signal.SIGINT)
+    told, _ = watch.communicate(timeout=60)
+    assert "ticks seen, written to" in told, told
+    assert [f.name for f in tmp_path.iterdir() if "live" in f.name] == ["live.rrd"]
+    checked = subprocess.run([str(BIN / "rerun"), "rrd", "verify", recording], capture_output=True, text=True)
+    assert checked.returncode == 0 and recording.stat().st_size > 10_000, checked.stderr
     valid("groundstation fly", flown)
     (tracked,) = json.loads(ground("track", flown["record"], "--json"))
     assert tracked["rms"] < 0.15

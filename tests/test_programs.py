@@ -1,0 +1,46 @@
+"""What the three programs have in common: a version, help by task, one line where a library is missing."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import programs
+import pytest
+
+from trueflight import __version__
+from trueflight.groundstation.commands.app import TASKS, app
+
+BIN = Path(sys.executable).parent
+WITHOUT = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {"scipy", "torch", "control", "rerun", "mujoco", "threadpoolctl", "onnx", "pyulog"}:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+from trueflight.groundstation.commands.app import main
+main()
+"""
+"""`groundstation` where only what the companion needs is installed."""
+
+
+@pytest.mark.parametrize("program", ["groundstation", "companion", "sim-bridge"])
+def test_every_program_tells_its_version(program: str) -> None:
+    told = subprocess.run([str(BIN / program), "--version"], capture_output=True, text=True)
+    assert (told.returncode, told.stdout) == (0, f"{program} {__version__}\n")
+
+
+def test_every_command_stands_under_a_task() -> None:
+    known = {c.name for c in app.registered_commands} | {g.name for g in app.registered_groups}
+    told = [name for names in TASKS.values() for name in names]
+    assert sorted(told) == sorted(known)
+    page = programs.run("groundstation", "--help").stdout
+    assert sorted(TASKS, key=lambda task: page.index(f"─ {task} ─")) == list(TASKS)
+
+
+def test_in_the_companions_environment_it_says_what_to_install() -> None:
+    told = subprocess.run(
+        [sys.executable, "-c", WITHOUT, "diagnose", "flight.csv"], capture_output=True, text=True
+    )
+    assert told.returncode == 2
+    assert told.stderr == "error: scipy is not installed here; pip install 'trueflight[ground]'\n"
