@@ -81,11 +81,11 @@ def plan_command(
     directory = None if effects is None else str(effects)
     with working(console, "reading", as_json) as progress:
         read = None if flight is None else read_flight(flight, vehicle, mapping)
+        believed = load_vehicle(str(vehicle)) if read is None else read.vehicle
+        gains = design_to_fly(believed, read, design)  # before what takes long
         diagnosis = None
         if read is not None:
             diagnosis = diagnose(read, choose_start(read, model, store, effects), progress=progress)
-        believed = load_vehicle(str(vehicle)) if read is None else read.vehicle
-        gains = design_to_fly(believed, read, design)
         plan = plan_flight(gains, believed, limits, diagnosis, between or (), directory, progress)
     write_whole(output, setpoints(plan.trajectory), "the plan", "choose another -o")
     if as_json:

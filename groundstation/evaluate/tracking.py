@@ -78,11 +78,12 @@ def track_file(
 
 
 def told_apart(tracked: Sequence[Tracking]) -> list[Tracking]:
-    """The same flights, numbered in their labels where those would be equal."""
+    """The same flights, labelled by their files too where labels would be equal, and by numbers where those are."""
     labels = [t.label for t in tracked]
+    named = [f"{t.flight.name}: {t.label}" if labels.count(t.label) > 1 else t.label for t in tracked]
     return [
-        replace(t, label=f"{t.label} ({number + 1})") if labels.count(t.label) > 1 else t
-        for number, t in enumerate(tracked)
+        replace(t, label=f"{name} ({number})" if named.count(name) > 1 else name)
+        for number, (t, name) in enumerate(zip(tracked, named, strict=True), 1)
     ]
 
 

@@ -100,7 +100,10 @@ def design_to_fly(vehicle: Vehicle, flight: Flight | None = None, given: str | P
         return recorded
     beside = Path(vehicle.source).with_name("design.json") if vehicle.source else Path("design.json")
     if not beside.is_file():
-        raise InputError(f"{beside}: no design to predict the flight by; pass --design FILE")
+        make = f"groundstation design {vehicle.source or 'VEHICLE'} -o {beside}"
+        raise InputError(
+            f"{beside}: no design to predict the flight by; make one ({make}), or pass --design FILE"
+        )
     return load_design(beside, vehicle)
 
 
