@@ -80,7 +80,7 @@ class Simulator:
         if self._underway is not None:
             self._underway.append(self.moment())
         self._flying_steps = 0
-        self._events = after_takeoff(hidden, vehicle)
+        self._events = after_takeoff(hidden, vehicle, self.airframe, self.sensors)
         self._ahead = list(self._events)
 
     def start_in_hover(
@@ -171,6 +171,7 @@ class Simulator:
             self._flying_steps = 0
             self._ahead = list(self._events)
             world.unload()
+            self.airframe.restore()
 
     def estimate(self) -> Estimate:
         """What the vehicle believes of itself now; the same sample until the next step."""

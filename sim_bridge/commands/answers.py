@@ -29,7 +29,8 @@ def reveal(file: Path, as_json: Json = False) -> None:
         numbers = (
             f"{key} {entry['value']:.4g} {entry['unit']}" for key, entry in effect["parameters"].items()
         )
-        lines.append(f"{effect['name']}: " + ", ".join(numbers))
+        begins = f", from {effect['begins']['value']:g} s after take-off" if "begins" in effect else ""
+        lines.append(f"{effect['name']}: " + ", ".join(numbers) + begins)
     tell(answer, "\n".join(lines) or "nothing was hidden", as_json)
 
 
@@ -66,6 +67,7 @@ def effects(as_json: Json = False) -> None:
             "random": effect.drawn,
             "any": effect.name in pool("any"),
             "rich": RICH.get(effect.name),
+            "may_begin": effect.may_begin,
         }
         for effect in EFFECTS.values()
     ]

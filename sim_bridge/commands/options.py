@@ -43,7 +43,10 @@ class Wanted:
 
     hidden: Annotated[
         list[str] | None,
-        typer.Option(help="Effect to hide: NAME, NAME:SIZE, rich, random, any, none. Repeatable."),
+        typer.Option(
+            help="Effect to hide: NAME, NAME:SIZE, rich, random, any, none; NAME@SECONDS begins in flight. "
+            "Repeatable."
+        ),
     ] = None
     hidden_count: Annotated[int | None, typer.Option(help="How many effects `random` or `any` draws.")] = None
 

@@ -124,6 +124,16 @@ class Airframe:
         self._follow = 1.0 - math.exp(-dt / tau) if tau > 0 else 1.0
         self._power_per_speed = powertrain.torque_per_thrust / _MOTOR_EFFICIENCY
         self._steps = 0
+        self.keep()
+
+    def keep(self) -> None:
+        """Remember what acts now as what acts at every take-off."""
+        self._at_takeoff = self.powertrain, self.wind, tuple(self.on_rotors), tuple(self.on_body)
+
+    def restore(self) -> None:
+        """Undo what began in flight."""
+        self.powertrain, self.wind, on_rotors, on_body = self._at_takeoff
+        self.on_rotors, self.on_body = list(on_rotors), list(on_body)
 
     def speed_of(self, command: float) -> float:
         """Rotor speed, rad/s, that a motor command (normalised) settles at."""

@@ -45,6 +45,8 @@ class TruthEffect:
     """Whether `random` and `any` draw it: the first ten, so that a seed hides for ever what it hid."""
     any_draws: bool = False
     """Whether `any` draws it, though `random` does not: for one that shows in every flight."""
+    may_begin: bool = False
+    """Whether it can begin in flight: it acts on thrust constants, rotors, body or air alone."""
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
         """All parameters, drawn, or around a given size."""

@@ -3,30 +3,36 @@
 from __future__ import annotations
 
 import difflib
+import math
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from trueflight.models.errors import InputError
 from trueflight.models.vehicle import Vehicle
+from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.effects import EFFECTS
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """One hidden effect with every number that it acts by."""
+    """One hidden effect with every number that it acts by; it `begins` so many s after take-off."""
 
     name: str
     parameters: dict[str, float]
+    begins: float = 0.0
 
     def answer(self) -> dict[str, object]:
-        """As `sim-bridge reveal` tells it: name and parameters with their units."""
+        """As `sim-bridge reveal` tells it: name and parameters with their units, and `begins` where that is in
+        flight.
+        """
         units = EFFECTS[self.name].units
-        return {
+        told: dict[str, object] = {
             "name": self.name,
             "parameters": {
                 key: {"value": value, "unit": units[key]} for key, value in self.parameters.items()
             },
         }
+        return told | {"begins": {"value": self.begins, "unit": "s"}} if self.begins else told
 
 
 RICH: dict[str, tuple[float, float]] = {
@@ -77,6 +83,7 @@ def choose(
     requests: list[str], vehicle: Vehicle, seed: int, count: int = 1, strength: float = 1.0
 ) -> tuple[Hidden, ...]:
     """What to hide, from `NAME`, `NAME:SIZE`, `none`, `random` or `rich` requests; the same seed hides the same.
+    `@SECONDS` at the end of a name or size lets the effect begin so long after take-off.
 
     Sizes that are drawn are `strength` times as far from "nothing hidden" as usual; `rich` and given sizes stay.
 
@@ -103,27 +110,48 @@ def choose(
         if request == "rich":
             chosen |= {one.name: one for one in rich(vehicle, seed)}
             continue
-        name, colon, text = request.partition(":")
+        asked, at, moment = request.partition("@")
+        name, colon, text = asked.partition(":")
         if name not in EFFECTS:
             known = [*EFFECTS, "rich", "random", "any", "none"]
             close = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
             raise InputError(f"--hidden {request}: unknown effect '{name}'; {hint}")
-        effect, size = EFFECTS[name], None
-        if colon:
-            try:
-                size = float(text)
-            except ValueError:
-                raise InputError(
-                    f"--hidden {request}: '{text}' is not a number; write NAME or NAME:SIZE"
-                ) from None
-            if not effect.least <= size <= effect.most:
-                unit = next(iter(effect.units.values()))
-                raise InputError(
-                    f"--hidden {request}: size must be {effect.least:g} to {effect.most:g} {unit}"
-                )
-        chosen[name] = _make(name, size, vehicle, seed, strength)
+        size = _size(request, EFFECTS[name], text) if colon else None
+        begins = _moment(request, EFFECTS[name], moment) if at else 0.0
+        chosen[name] = replace(_make(name, size, vehicle, seed, strength), begins=begins)
     return tuple(chosen.values())
+
+
+def _size(request: str, effect: TruthEffect, text: str) -> float:
+    size = _number(request, text)
+    if not effect.least <= size <= effect.most:
+        unit = next(iter(effect.units.values()))
+        raise InputError(f"--hidden {request}: size must be {effect.least:g} to {effect.most:g} {unit}")
+    return size
+
+
+def _moment(request: str, effect: TruthEffect, text: str) -> float:
+    moment = _number(request, text)
+    if not effect.may_begin:
+        able = ", ".join(name for name, one in EFFECTS.items() if one.may_begin)
+        raise InputError(
+            f"--hidden {request}: {effect.name} acts from the start only; these can begin in flight: {able}"
+        )
+    if not 0.0 <= moment < math.inf:
+        raise InputError(
+            f"--hidden {request}: begins {moment:g} s after take-off; write a time of 0 or later"
+        )
+    return moment
+
+
+def _number(request: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(
+            f"--hidden {request}: '{text}' is not a number; write NAME, NAME:SIZE or NAME:SIZE@SECONDS"
+        ) from None
 
 
 def _make(name: str, size: float | None, vehicle: Vehicle, seed: int, strength: float) -> Hidden:

@@ -244,6 +244,48 @@ def test_the_time_of_a_payload_begins_at_take_off_and_it_is_gone_after_landing(v
             simulator.step(0.35, 0.0, 0.0, 0.0)
 
 
+def test_what_begins_in_flight_acts_from_then_on_and_is_over_after_landing(vehicle: Vehicle) -> None:
+    hidden = choose(["rotor_damage:0.5@0.5", "wind:4@1", "rotor_drag:0.3"], vehicle, 0)
+    simulator = Simulator(vehicle, hidden, noise=NO_NOISE)
+    airframe, whole = simulator.airframe, simulator.airframe.powertrain
+    for flight in range(2):
+        simulator.start_in_hover((0.0, 0.0, 5.0))
+        weak = windy = 0
+        for _ in range(600):
+            simulator.step(vehicle.hover_thrust, 0.0, 0.0, 0.0)
+            weak += airframe.powertrain != whole
+            windy += airframe.wind != (0.0, 0.0, 0.0)
+        assert (weak, windy) == (600 - 249, 600 - 499), flight
+        assert sorted(airframe.powertrain.thrust_constants)[0] == pytest.approx(
+            0.5 * whole.thrust_constants[0]
+        )
+        assert len(airframe.on_body) == 1, "a wind beside drag brings none of its own"
+        simulator.rest()
+        assert (airframe.powertrain, airframe.wind) == (whole, (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("request_", "told"),
+    [
+        ("motor_lag@3", "acts from the start only"),
+        ("wind:4@soon", "'soon' is not a number"),
+        ("wind@-1", "write a time of 0 or later"),
+        ("wind@nan", "write a time of 0 or later"),
+        ("wind:99@3", "size must be"),
+    ],
+)
+def test_what_cannot_begin_so_is_told(vehicle: Vehicle, request_: str, told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        choose([request_], vehicle, 0)
+
+
+def test_a_sealed_answer_tells_when_an_effect_begins(vehicle: Vehicle, tmp_path: Path) -> None:
+    seal(choose(["rotor_damage@41.5", "wind"], vehicle, 2), vehicle.name, 2, tmp_path / "a.sealed")
+    damage, wind = reveal(tmp_path / "a.sealed")["effects"]
+    assert damage["begins"] == {"value": 41.5, "unit": "s"}
+    assert "begins" not in wind
+
+
 # Battery
 
 

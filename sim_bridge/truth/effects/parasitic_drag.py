@@ -21,6 +21,7 @@ class ParasiticDrag(TruthEffect):
     what = "the frame drags with the square of the air's velocity"
     low, high, most = 0.05, 0.14, 5.0
     drawn = True
+    may_begin = True
     units: ClassVar = {"x": "1/m", "y": "1/m", "z": "1/m"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

@@ -17,6 +17,7 @@ class RotorDamage(TruthEffect):
     name = "rotor_damage"
     what = "one rotor gives less thrust than the others at the same speed"
     low, high, most, any_draws = 0.08, 0.16, 0.7, True
+    may_begin = True
     units: ClassVar = {"loss": "1", "rotor": "1"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

@@ -23,6 +23,7 @@ class RotorDrag(TruthEffect):
     what = "each rotor drags in its plane, in proportion to its speed and the air's velocity there"
     low, high, most = 0.15, 0.45, 5.0
     drawn = True
+    may_begin = True
     units: ClassVar = {"x": "1/s", "y": "1/s"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

@@ -18,6 +18,7 @@ class ThrustGain(TruthEffect):
     what = "thrust of every rotor is off by a factor"
     low, high, least, most = 0.93, 1.18, 0.5, 2.0
     drawn = True
+    may_begin = True
     units: ClassVar = {"gain": "1"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:

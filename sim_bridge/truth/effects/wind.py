@@ -22,6 +22,7 @@ class Wind(TruthEffect):
     what = "a steady horizontal wind, acting through rotor drag"
     low, high, most = 3.0, 5.5, 15.0
     drawn = True
+    may_begin = True
     units: ClassVar = {"speed": "m/s", "east": "m/s", "north": "m/s", "drag": "1/s"}
 
     def draw(self, vehicle: Vehicle, size: float | None, generator: random.Random) -> dict[str, float]:
