@@ -204,13 +204,14 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """A parameter with its 95 % interval."""
+    """A parameter with its 95 % interval; `flight` names the one of several flights that alone it holds for."""
 
     name: str
     value: float
     low: float
     high: float
     unit: str
+    flight: str = ""
 
 
 @dataclass(frozen=True)
@@ -251,6 +252,47 @@ class RotationalRms:
 
 
 @dataclass(frozen=True)
+class OneFlight:
+    """What one of several flights adds to their common diagnosis; RMS in m/s² over all axes.
+
+    `model` is the base with every effect found, with this flight's own numbers. `clock_shift` (s), `unexplained` and
+    `left_out` as in `Diagnosis`.
+    """
+
+    flight: Flight
+    model: Model
+    rms_before: float
+    rms_after: float
+    noise_floor: float
+    clock_shift: float | None
+    unexplained: Unexplained
+    left_out: dict[str, float]
+
+
+@dataclass(frozen=True)
+class SharedNumber:
+    """A number of the vehicle, asked whether it is the same in all of several flights.
+
+    `ratio` is twice the log likelihood ratio of one value for each flight against one for all, in independent samples;
+    `p_value` the probability of as much by chance. `values` has one estimate for each flight. Where the flights differ,
+    `apart` names those that disagree with the others, whose value is `common` (all, and None, where no two agree).
+    """
+
+    effect: str
+    parameter: str
+    ratio: float
+    p_value: float
+    values: tuple[ParameterEstimate, ...]
+    common: ParameterEstimate | None
+    apart: tuple[str, ...] = ()
+
+    @property
+    def differs(self) -> bool:
+        """Whether it is not the same in all flights."""
+        return bool(self.apart)
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """The result of `diagnose`. RMS figures in m/s² over all axes, behind the stated bandwidth in Hz.
 
@@ -261,6 +303,11 @@ class Diagnosis:
     `left_out` the share of the samples that did not count, by reason. `rotational` is the residual of the angular
     acceleration, None where it was not seen; `alternatives` are other sets of effects that explain the flight nearly as
     well as those found.
+
+    Of several flights fitted together, `flights` tells what each adds (empty for one), and `flight` is the last of
+    them; `shared` asks of each number of the vehicle whether it is the same in all; `model` has what is the vehicle's,
+    and `set_aside` names what is not: "wind"; `held_out_model` has the held-out flight's own numbers. RMS figures are
+    then over all flights.
     """
 
     flight: Flight
@@ -279,6 +326,15 @@ class Diagnosis:
     left_out: dict[str, float]
     rotational: RotationalRms | None = None
     alternatives: tuple[tuple[str, ...], ...] = ()
+    flights: tuple[OneFlight, ...] = ()
+    shared: tuple[SharedNumber, ...] = ()
+    set_aside: tuple[str, ...] = ()
+    held_out_model: Model | None = None
+
+    @property
+    def differing(self) -> tuple[SharedNumber, ...]:
+        """Numbers of the vehicle that are not the same in all of several flights."""
+        return tuple(n for n in self.shared if n.differs)
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -11,11 +11,13 @@ from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
     BandwidthOption,
     EffectsOption,
-    FlightArgument,
+    FlightsArgument,
     JsonOption,
     MappingOption,
     ModelOption,
+    PerFlightOption,
     SaveOption,
+    SharedOption,
     StoreOption,
     ValidateOption,
     VehicleOption,
@@ -33,7 +35,7 @@ def register(app: typer.Typer) -> None:
 
 
 def diagnose_command(
-    flight: FlightArgument,
+    flight: FlightsArgument,
     vehicle: VehicleOption = None,
     validate: ValidateOption = None,
     mapping: MappingOption = None,
@@ -51,36 +53,41 @@ def diagnose_command(
             "--thrust", help="command, or rotors: thrust by rotor speeds, what is beyond them is judged."
         ),
     ] = "command",
+    per_flight: PerFlightOption = None,
+    shared: SharedOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Which effect is missing: ranked, with parameters and intervals, checked on held-out data.
 
+    Several flights of one vehicle, in the order of time, are fitted together: what is the vehicle's is shared, wind,
+    offsets of the sensor and the clock are each flight's own, and what differs is told.
+
     Example: groundstation diagnose identify.csv --vehicle vehicle.toml --validate validate.csv --save analysis.rrd
     """
-    from trueflight.groundstation.evaluate.analysis import analyse
+    from trueflight.groundstation.evaluate.analysis import gather
+    from trueflight.groundstation.identify.flights import diagnose_flights
     from trueflight.groundstation.identify.rotors import thrust_from_rotors
-    from trueflight.groundstation.identify.translation import diagnose
     from trueflight.groundstation.output.as_json import analysis_table
     from trueflight.groundstation.output.tables import print_diagnosis
-    from trueflight.groundstation.reading import read_flight
-    from trueflight.groundstation.reading.several import read_held_out
+    from trueflight.groundstation.reading.several import read_held_out, read_together
     from trueflight.groundstation.versions.choice import choose_design, choose_line
 
     if thrust not in ("command", "rotors"):
         raise InputError(f"--thrust {thrust}: choose command or rotors")
-    read = read_flight(flight, vehicle, mapping)
-    held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
+    flights = read_together(flight, vehicle, mapping)
+    held_out = None if validate is None else read_held_out(validate, flights[0], vehicle, mapping)
     if thrust == "rotors":
-        read = thrust_from_rotors(read)
+        flights = [thrust_from_rotors(one) for one in flights]
         held_out = None if held_out is None else thrust_from_rotors(held_out)
-    line = choose_line(read, model, store, effects)
+    line = choose_line(flights[0], model, store, effects)
     with working(console, "looking for missing effects", as_json) as progress:
+        found = diagnose_flights(
+            flights, line[-1], held_out, bandwidth, per_flight or (), shared or (), progress
+        )
         if save is None and not as_json:
-            print_diagnosis(
-                console, diagnose(read, line[-1], held_out, bandwidth, progress=progress), everything
-            )
+            print_diagnosis(console, found, everything)
             return
-        whole = analyse(read, line, held_out, bandwidth, choose_design(read), progress=progress)
+        whole = gather(found, line, held_out, bandwidth, choose_design(found.flight), progress=progress)
     if save is not None:
         from trueflight.groundstation.views import write_analysis
 

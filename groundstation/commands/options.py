@@ -14,6 +14,28 @@ from trueflight.models.contract import CONTROLLERS
 FlightArgument = Annotated[
     Path, typer.Argument(help="A flight: CSV, Parquet, PX4 ULog, MCAP of the companion or ROS 2.")
 ]
+FlightsArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="FLIGHT...", help="A flight: CSV, Parquet, ULog, MCAP. Or several of one vehicle."
+    ),
+]
+PerFlightOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--per-flight",
+        metavar="EFFECT[.PARAMETER]",
+        help="Of several flights: each has its own. Repeatable.",
+    ),
+]
+SharedOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--shared",
+        metavar="EFFECT[.PARAMETER]",
+        help="Of several flights: one for all. Repeatable.",
+    ),
+]
 VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", help="vehicle.toml; default: beside the flight.")
 ]

@@ -16,6 +16,7 @@ import numpy as np
 
 from trueflight.groundstation.evaluate.compare import compare
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
+from trueflight.groundstation.evaluate.side_by_side import side_by_side as beside
 from trueflight.groundstation.evaluate.tracking import Tracking, missions, track
 from trueflight.groundstation.evaluate.where import where_it_fails
 from trueflight.groundstation.identify.fitting import MeasuredFlights, fit, model_of
@@ -127,9 +128,11 @@ def gather(
     progress: Callable[[str], None] = lambda _: None,
 ) -> Analysis:
     """All there is to see beside a `diagnosis` that was made from the last model of `line`, as `analyse` has it."""
-    flight, base = diagnosis.flight, line[-1]
+    flight, base, flights = diagnosis.flight, line[-1], [f.flight for f in diagnosis.flights]
     progress("adding the effects one by one")
     models = [*line, *steps_to(diagnosis, bandwidth)]
+    if side_by_side is None and flights:
+        side_by_side = beside(flights, [[_unnumbered(f.model)] for f in diagnosis.flights], bandwidth)
     if models[0].terms or models[0].network is not None:
         models.insert(0, linear_model(flight.vehicle))
     comparisons = []
@@ -140,7 +143,10 @@ def gather(
     held_out = (
         ()
         if validation is None
-        else tuple(compare(validation, model, bandwidth, horizons=False) for model in models)
+        else tuple(
+            compare(validation, _on_held_out(model, models, diagnosis), bandwidth, horizons=False)
+            for model in models
+        )
     )
     first = next(k for k, m in enumerate(models) if m is base)
     where = where_it_fails(comparisons[first])
@@ -158,14 +164,20 @@ def gather(
         _tracked(flight, design),
         _reference(flight),
         side_by_side,
-        provenance(*_roles(flight, validation, side_by_side)),
+        provenance(*_roles(flights or [flight], validation, side_by_side)),
     )
 
 
+def _on_held_out(model: Model, models: Sequence[Model], diagnosis: Diagnosis) -> Model:
+    """The model for the held-out flight: with its own wind where several flights had each their own."""
+    own = diagnosis.held_out_model if model is models[-1] else None
+    return model if own is None else _unnumbered(own)
+
+
 def _roles(
-    flight: Flight, validation: Flight | None, side_by_side: SideBySide | None
+    flights: Sequence[Flight], validation: Flight | None, side_by_side: SideBySide | None
 ) -> list[tuple[str, Flight]]:
-    roles = [("flight", flight)]
+    roles = [("flight", flight) for flight in flights]
     if validation is not None:
         roles.append(("held-out flight", validation))
     if side_by_side is not None:
@@ -175,8 +187,12 @@ def _roles(
 
 def steps_to(diagnosis: Diagnosis, bandwidth: float | None = None) -> list[Model]:
     """The models from the base to the diagnosed one, one more effect each, the most important first; what was found
-    before is fitted anew with each. Effects seen in the rotation alone change no acceleration and are no step."""
+    before is fitted anew with each. Effects seen in the rotation alone change no acceleration and are no step. Where
+    several flights were fitted together, all is added in one step, with the numbers of the last flight."""
     base, last = diagnosis.base, diagnosis.model
+    if diagnosis.flights:
+        whole = diagnosis.flights[-1].model
+        return [_unnumbered(whole)] if whole.names() != base.names() else []
     ranked = [
         e.name
         for e in sorted(diagnosis.effects, key=lambda e: e.rank or 0)

@@ -123,17 +123,24 @@ class MeasuredFlights:
 
         piece = lru_cache(maxsize=keep)(force) if keep else force
 
+        def all_of_it(flight: int, key: tuple[tuple[float, ...], ...]) -> np.ndarray:
+            return self.behind_filter(self.measurements[flight], piece(flight, key))
+
+        seen = lru_cache(maxsize=keep)(all_of_it) if keep else all_of_it
+
         def predicted(all_values: Sequence[Values]) -> np.ndarray:
             parts = []
             for flight, m in enumerate(self.measurements):
                 t = m.flight.t
-                pieces = []
-                for rows in cut_at(all_values, flight, t):
+                cuts, keys = cut_at(all_values, flight, t), []
+                for rows in cuts:
                     here = [held(values, flight, float(t[rows.start])) for values in all_values]
-                    key = tuple(tuple(v[k] for k in n) for v, n in zip(here, names, strict=True))
-                    pieces.append(piece(flight, key)[rows])
-                whole = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
-                parts.append(self.behind_filter(m, whole))
+                    keys.append(tuple(tuple(v[k] for k in n) for v, n in zip(here, names, strict=True)))
+                if len(keys) == 1:
+                    parts.append(seen(flight, keys[0]))
+                    continue
+                pieces = [piece(flight, key)[rows] for key, rows in zip(keys, cuts, strict=True)]
+                parts.append(self.behind_filter(m, np.concatenate(pieces)))
             return np.concatenate(parts)
 
         return predicted
@@ -150,6 +157,11 @@ class MeasuredFlights:
     def motions(self) -> tuple[Motion, ...]:
         """Each flight as effects see it, before any of them acts."""
         return tuple(motion_of_flight(m.flight) for m in self.measurements)
+
+    @cached_property
+    def flight_of_rows(self) -> np.ndarray:
+        """Number of the flight of each used sample (K,)."""
+        return np.repeat(np.arange(len(self.measurements)), [int(m.used.sum()) for m in self.measurements])
 
     @cached_property
     def survey(self) -> Motion:

@@ -19,7 +19,7 @@ from trueflight.groundstation.identify.fitting import (
 from trueflight.groundstation.identify.search import Choice, State, evidence, sizes, whole
 from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Values, number
 from trueflight.groundstation.measured.measurement import Measurement
-from trueflight.models.effect import Effect, Stage
+from trueflight.models.effect import Effect, Parameter, Stage
 from trueflight.models.effects import catalogue
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model, Term
@@ -192,10 +192,7 @@ class ForceProblem:
             rest = [(e, v) for e, v in chain if e.name != effect.name]
             for p in sizes(effect):
                 to = p.typical if p.typical != present[p.name] else p.typical * 1.5
-                for span in choice.spans or (EVERYWHERE,):
-                    moved = {**present, p.name: number([(span, to)], none[p.name])}
-                    prediction = self.flights.predict([*rest, (effect, moved)])
-                    columns.append((prediction - base).ravel())
+                columns += self._moved([*rest], effect, present, (p, to), none, self.held_on(choice, p), base)
             chain = [*rest, (effect, effect.typical(self.flights.survey) | at)]
             base = self.flights.predict(chain) if len(step) > 1 else base
         matrix = np.column_stack([here.jacobian.reshape(self.samples, -1), *columns])
@@ -215,12 +212,38 @@ class ForceProblem:
         rest = [(self.effects[n], v) for n, v in values.items() if n != effect.name]
         neutral = self.at_rest(effect)
         base = self.flights.predict([*rest, (effect, neutral)])
-        moved = (
-            {**neutral, p.name: number([(span, p.typical)], neutral[p.name])}
-            for p in sizes(effect)
-            for span in choice.spans or (EVERYWHERE,)
-        )
-        return np.column_stack([(self.flights.predict([*rest, (effect, m)]) - base).ravel() for m in moved])
+        columns = []
+        for p in sizes(effect):
+            columns += self._moved(
+                rest, effect, neutral, (p, p.typical), neutral, self.held_on(choice, p), base
+            )
+        return np.column_stack(columns)
+
+    def held_on(self, choice: Choice, parameter: Parameter) -> tuple[Span, ...]:
+        """The spans on which a candidate has a number of its own."""
+        return choice.spans or (EVERYWHERE,)
+
+    def _moved(
+        self,
+        rest: Sequence[tuple[Effect, Values]],
+        effect: Effect,
+        values: Values,
+        to: tuple[Parameter, float],
+        elsewhere: Mapping[str, float],
+        spans: Sequence[Span],
+        base: np.ndarray,
+    ) -> list[np.ndarray]:
+        """What one number of `effect` changes in the prediction when it is set, beside `rest`, in each of its spans."""
+        name, value = to[0].name, to[1]
+        if all(span == Span(span.flight) for span in spans):  # flights know nothing of each other
+            everywhere = (self.flights.predict([*rest, (effect, {**values, name: value})]) - base).ravel()
+            flight = np.repeat(self.flights.flight_of_rows, base.shape[1])
+            return [
+                everywhere if s.flight is None else np.where(flight == s.flight, everywhere, 0.0)
+                for s in spans
+            ]
+        moved = ({**values, name: number([(span, value)], elsewhere[name])} for span in spans)
+        return [(self.flights.predict([*rest, (effect, m)]) - base).ravel() for m in moved]
 
     def adequate(self, here: Fit) -> bool:
         """Whether no axis has much more left than its noise."""
@@ -246,7 +269,7 @@ class ForceProblem:
             replace(f, span=span)
             for f in free_parameters(effect, self.flights.survey)
             if not f.parameter.structural
-            for span in choice.spans or (EVERYWHERE,)
+            for span in self.held_on(choice, f.parameter)
         ]
         free = (*here.free, *own)
         scale = np.array([f.parameter.typical - rest[f.parameter.name] for f in own])

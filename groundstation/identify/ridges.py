@@ -31,7 +31,7 @@ SPAN = 6.0
 @dataclass(frozen=True)
 class Ridge:
     """One number of a product by its profile: `low` and `high` as in a 95 % interval, and whether it is `determined`;
-    `product` with the number it is tied to."""
+    `product` with the number it is tied to. Of several flights, `flight` is that of a number that holds for one."""
 
     effect: str
     parameter: str
@@ -39,12 +39,14 @@ class Ridge:
     high: float
     determined: bool
     product: ParameterEstimate
+    flight: str = ""
 
 
 def ridges(problem: ForceProblem, here: Fit, found: Sequence[str]) -> tuple[Ridge, ...]:
     """What is known of each number of the effects `found` that act through another, and of those of the others, where
     the flight does not determine both by far."""
     told: list[Ridge] = []
+    several = len(problem.flights.measurements) > 1
     for name in found:
         carriers = [n for n in problem.effects[name].acts_through if here.of(n)]
         for i in here.sizes(name):
@@ -52,6 +54,8 @@ def ridges(problem: ForceProblem, here: Fit, found: Sequence[str]) -> tuple[Ridg
             if not others or _sharp(here, i) or not np.any(here.jacobian[:, :, i]):
                 continue
             partner = max(others, key=lambda j: abs(_correlation(here, i, j)))
+            if several and _sharp(here, partner):
+                continue  # other flights determine it, and beside it the number is as good as linear
             pair = [_ridge(problem, here, i, partner)]
             if not pair[0].determined and not _sharp(here, partner):
                 pair.append(_ridge(problem, here, partner, i))
@@ -63,17 +67,19 @@ def with_ridges(verdicts: Sequence[EffectVerdict], told: Sequence[Ridge]) -> lis
     """Verdicts with the intervals of the profiles; what is not determined is told as such, with its product."""
     out = []
     for v in verdicts:
-        own = {r.parameter: r for r in told if r.effect == v.name}
+        own = {(r.parameter, r.flight): r for r in told if r.effect == v.name}
         if not own:
             out.append(v)
             continue
         parameters = tuple(
-            replace(p, low=own[p.name].low, high=own[p.name].high) if p.name in own else p
+            replace(p, low=own[p.name, p.flight].low, high=own[p.name, p.flight].high)
+            if (p.name, p.flight) in own
+            else p
             for p in v.parameters
         )
         loose = [r for r in own.values() if not r.determined]
         # no number of a product has another "no effect" than zero
-        intervals = [(p.low, p.high) for p in v.parameters if p.name not in own]
+        intervals = [(p.low, p.high) for p in v.parameters if (p.name, p.flight) not in own]
         intervals += [(r.low, r.high) for r in own.values() if r.determined]
         known = any(not low <= 0.0 <= high for low, high in intervals)
         out.append(
@@ -110,7 +116,7 @@ def _ridge(problem: ForceProblem, here: Fit, i: int, partner: int) -> Ridge:
     if not determined:  # never an interval that excludes "no effect"
         low, high = min(low, free.neutral), max(high, free.neutral)
     return Ridge(free.effect, free.parameter.name, min(low, value), max(high, value), determined,
-                 _product(here, i, partner))  # fmt: skip
+                 _product(here, i, partner), "" if free.span.flight is None else str(free.span.flight))  # fmt: skip
 
 
 def _end(problem: ForceProblem, here: Fit, i: int, half: float) -> tuple[float, bool]:

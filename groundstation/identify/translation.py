@@ -86,7 +86,7 @@ def _diagnose(
     looked_at = replace(entire, flights=measured(*parts)) if parts else entire
     if has_rotor_speeds(flight):
         progress("looking between command and rotors")
-        looked_at = replace(looked_at, on_the_way=_on_the_way(looked_at))
+        looked_at = replace(looked_at, on_the_way=shown_by_rotors(looked_at))
         entire = entire if parts else looked_at
     search = Search(looked_at, progress)
     found = search.select()
@@ -98,7 +98,7 @@ def _diagnose(
     return _report(search, search.state(kept.choices), everything, rotation)
 
 
-def _on_the_way(problem: ForceProblem) -> tuple[Term, ...]:
+def shown_by_rotors(problem: ForceProblem) -> tuple[Term, ...]:
     """The effects that rotor speeds show between command and rotor.
 
     None where they leave more of the rotors' thrust unexplained than the accelerometer's noise: there the rotors did
@@ -183,7 +183,7 @@ def _verdicts(
     scale = Scale(
         before * problem.samples, lambda share: f": {np.sqrt(max(share, 0.0) * before):.3f} m/s² RMS"
     )
-    named, absent = judge(search, found, here, scale, lambda name: _seen_as(problem, name, here), doubt)
+    named, absent = judge(search, found, here, scale, lambda name: seen_as(problem, name, here), doubt)
     named = with_ridges(named, ridges(entire, here, found.names))
     candidates = {c.effect for c in problem.choices}
     others = [
@@ -191,8 +191,9 @@ def _verdicts(
         for n, e in problem.effects.items()
         if n not in candidates and n not in base.names() and not e.rotational
     ]
-    later = _later(problem, found.names, here)
-    rates, terms = judge_rates(entire.flight, base.names(), base.effects_directory, later)
+    rates, terms = judge_rates(
+        entire.flight, base.names(), base.effects_directory, later(problem, found.names, here)
+    )
     unseen = tuple(
         v.name for v in absent if v.verdict == NOT_EXCITED and problem.effects[v.name].stage is Stage.COMMAND
     )
@@ -205,7 +206,7 @@ def _verdicts(
     return [*map(included, base.names()), *named, *by_weight(absent), *others, *turning], terms
 
 
-def _later(problem: ForceProblem, found: Sequence[str], here: Fit) -> float:
+def later(problem: ForceProblem, found: Sequence[str], here: Fit) -> float:
     """s by which rotors were found to follow their command later than believed: the rate loop is built on them."""
     terms = {t.effect: t for t in here.terms if t.effect in found} | {t.effect: t for t in problem.on_the_way}
     return sum(
@@ -216,7 +217,7 @@ def _later(problem: ForceProblem, found: Sequence[str], here: Fit) -> float:
     )
 
 
-def _seen_as(problem: ForceProblem, name: str, fitted: Fit) -> tuple[str, ...]:
+def seen_as(problem: ForceProblem, name: str, fitted: Fit) -> tuple[str, ...]:
     """Rotational effects that may be what `name` shows by less than neutral, where the flight lacks the columns to
     tell."""
     return tuple(

@@ -175,13 +175,15 @@ def also_possible(verdict: EffectVerdict, rivals: tuple[str, ...]) -> EffectVerd
 
 
 def estimates(fitted: Fit, name: str) -> tuple[ParameterEstimate, ...]:
-    """The parameters of an effect with their intervals; an axis that the flight does not measure has none."""
+    """The parameters of an effect with their intervals; an axis that the flight does not measure has none. Of several
+    flights, one that holds for a single one has its number."""
     return tuple(
         ParameterEstimate(
             fitted.free[i].parameter.name,
             float(fitted.estimate[i]),
             *fitted.interval(i),
             fitted.free[i].parameter.unit,
+            "" if fitted.free[i].span.flight is None else str(fitted.free[i].span.flight),
         )
         for i in fitted.of(name)
         if np.any(fitted.jacobian[:, :, i])

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
+from trueflight.groundstation.results import (
+    Comparison,
+    Diagnosis,
+    EffectVerdict,
+    ParameterEstimate,
+    WaterfallStep,
+    WhereItFails,
+)
 from trueflight.models.effect import Effect
 from trueflight.models.effects import effect_named
 from trueflight.models.flight import Flight
@@ -73,20 +80,15 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
                 "rank": e.rank,
                 "variance_share": e.variance_share,
                 "p_value": e.p_value,
-                "parameters": {
-                    p.name: {"value": p.value, "low": p.low, "high": p.high, "unit": p.unit}
-                    for p in e.parameters
-                },
+                "parameters": {p.name: interval_table(p) for p in e.parameters if not p.flight},
+                "per_flight": _per_flight(e),
                 "indistinguishable_from": list(e.indistinguishable_from),
                 "advice": e.advice,
                 "seen_in": e.seen_in,
                 "confidence": e.confidence,
                 "rests_on": e.rests_on,
                 "undetermined": list(e.undetermined),
-                "products": {
-                    p.name: {"value": p.value, "low": p.low, "high": p.high, "unit": p.unit}
-                    for p in e.products
-                },
+                "products": {p.name: interval_table(p) for p in e.products},
             }
             for e in d.effects
         ],
@@ -95,6 +97,7 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
         "unexplained": asdict(d.unexplained),
         "nuisance": {"clock_shift": {"value": d.clock_shift, "unit": "s"}},
         "left_out": d.left_out,
+        **_several_tables(d),
         "notes": list(d.flight.notes),
         "consistency": consistency_table(d.flight),
     }
@@ -103,6 +106,52 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
     if d.validation_before is not None:
         table["validation_rms"] = {"before": d.validation_before, "after": d.validation_after, "unit": UNIT}
     return plain(table)
+
+
+def interval_table(p: ParameterEstimate) -> dict[str, Any]:
+    """The JSON of a parameter with its interval."""
+    return {"value": p.value, "low": p.low, "high": p.high, "unit": p.unit}
+
+
+def _per_flight(e: EffectVerdict) -> dict[str, Any]:
+    """The numbers of an effect that are each flight's own, by flight."""
+    flights = dict.fromkeys(p.flight for p in e.parameters if p.flight)
+    return {name: {p.name: interval_table(p) for p in e.parameters if p.flight == name} for name in flights}
+
+
+def _several_tables(d: Diagnosis) -> dict[str, Any]:
+    """What several flights say together; empty for one."""
+    flights = [
+        {
+            "name": f.flight.name,
+            "duration": f.flight.duration,
+            "residual_rms": {
+                "before": f.rms_before,
+                "after": f.rms_after,
+                "noise_floor": f.noise_floor,
+                "unit": UNIT,
+            },
+            "clock_shift": {"value": f.clock_shift, "unit": "s"},
+            "unexplained": list(f.unexplained.where) if f.unexplained.verdict else [],
+            "left_out": f.left_out,
+            "notes": list(f.flight.notes),
+        }
+        for f in d.flights
+    ]
+    shared = [
+        {
+            "effect": n.effect,
+            "parameter": n.parameter,
+            "likelihood_ratio": n.ratio,
+            "p_value": n.p_value,
+            "differs": n.differs,
+            "apart": list(n.apart),
+            "common": None if n.common is None else interval_table(n.common),
+            "values": {v.flight: interval_table(v) for v in n.values},
+        }
+        for n in d.shared
+    ]
+    return {"flights": flights, "shared": shared, "set_aside": list(d.set_aside)}
 
 
 def consistency_table(flight: Flight) -> list[dict[str, Any]]:

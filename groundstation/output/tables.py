@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
+from trueflight.groundstation.output.several_tables import print_several
 from trueflight.groundstation.results import Comparison, Diagnosis, EffectVerdict, WaterfallStep, WhereItFails
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model
@@ -106,7 +107,7 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
     """The ranking of effects, and the residual before and after."""
     shown = [e for e in d.effects if everything or e.verdict in ("missing", "possible")]
     if shown:
-        table = Table(title=f"{d.flight.name}: which effect is missing", title_justify="left")
+        table = Table(title=f"{_of(d)}: which effect is missing", title_justify="left")
         table.add_column("effect", no_wrap=True)
         table.add_column("verdict", no_wrap=True)
         table.add_column("share of\nerror", justify="right")
@@ -124,13 +125,13 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
             )
         console.print(table)
     else:
-        console.print(
-            Text(f"{d.flight.name}: nothing is missing that this flight could show", style="bold green")
-        )
+        console.print(Text(f"{_of(d)}: nothing is missing that this flight could show", style="bold green"))
     line = f"residual {d.rms_before:.3f} -> {d.rms_after:.3f} m/s² (noise floor {d.noise_floor:.3f})"
     if d.validation_before is not None and d.validation_after is not None:
         line += f"; held-out flight {d.validation_before:.3f} -> {d.validation_after:.3f} m/s²"
     console.print(Text(line, style="bold"))
+    if d.flights:
+        print_several(console, d)
     for remark in d.remarks:
         console.print(remark, style="yellow", highlight=False)
     if d.rotational is not None:
@@ -161,13 +162,22 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
             console.print(f"[dim]{SAID[e.verdict]}[/dim] {e.name}: {e.advice}{rests}", highlight=False)
 
 
+def _of(d: Diagnosis) -> str:
+    if not d.flights:
+        return d.flight.name
+    return f"{len(d.flights)} flights of {d.flight.vehicle.name}"
+
+
 def _parameters(e: EffectVerdict) -> str:
     told = [
         f"{p.name} not determined"
         if p.name in e.undetermined
         else f"{p.name} = {p.value:.3g} {_unit(p.unit)}  [{p.low:.3g}, {p.high:.3g}]"
         for p in e.parameters
+        if not p.flight
     ]
+    own = dict.fromkeys(p.name for p in e.parameters if p.flight)
+    told += [f"{', '.join(own)}: each flight's own"] if own else []
     told += [f"{p.name} = {p.value:.3g}  [{p.low:.3g}, {p.high:.3g}]" for p in e.products]
     return "\n".join(told)
 

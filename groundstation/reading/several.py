@@ -35,12 +35,15 @@ def read_together(paths: Sequence[Path], vehicle: Path | None = None, mapping: G
 
 
 def told_apart(flights: Sequence[Flight]) -> list[Flight]:
-    """The flights, named by their folder too where two files have the same name."""
+    """The flights, named by their folder too where two files have the same name, and numbered where that is not
+    enough."""
     names = [f.name for f in flights]
-    return [
-        replace(f, name=f"{Path(f.origin).parent.name}/{f.name}") if names.count(f.name) > 1 else f
+    longer = [
+        f"{Path(f.origin).parent.name}/{f.name}" if names.count(f.name) > 1 and f.origin else f.name
         for f in flights
     ]
+    told = [f"{n} ({longer[: k + 1].count(n)})" if longer.count(n) > 1 else n for k, n in enumerate(longer)]
+    return [f if f.name == name else replace(f, name=name) for f, name in zip(flights, told, strict=True)]
 
 
 def read_flights(
