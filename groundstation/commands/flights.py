@@ -105,9 +105,11 @@ def import_command(
     mapping: MappingOption = None,
     draft: Annotated[
         Path | None,
-        typer.Option("--draft-vehicle", help="Draft a vehicle file from a PX4 log; never replaces one."),
+        typer.Option(
+            "--draft-vehicle", help="Draft a vehicle file from an autopilot's log; never replaces one."
+        ),
     ] = None,
-    mass: Annotated[float | None, typer.Option(help="kg, for the draft: PX4 does not know it.")] = None,
+    mass: Annotated[float | None, typer.Option(help="kg, for the draft: no autopilot knows it.")] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Only tell which columns agree with each other; writes nothing.")
     ] = False,
@@ -115,7 +117,7 @@ def import_command(
 ) -> None:
     """Read any flight, check it, and write it in the project's own format with its vehicle file beside it.
 
-    From a PX4 ULog a vehicle file can be drafted first: `--draft-vehicle vehicle.toml`, with or without `-o`.
+    typer.Option("--draft-vehicle", help="Draft a vehicle file from a log's parameters; never replaces one."),
     """
     from trueflight.groundstation.output.as_json import draft_table, imported_table
     from trueflight.groundstation.reading import read_flight

@@ -41,6 +41,7 @@ def assemble(
     mapping: Mapping | None = None,
     accelerometer: bool = True,
     named_by: Mapping | None = None,
+    rates: dict[str, float] | None = None,
 ) -> Flight:
     """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
     find what was flown.
@@ -49,7 +50,8 @@ def assemble(
     where the log says that the vehicle is in the air (without it, that is found out), `commanded` (N,) where these
     commands flew it; `notes` are told to the user; `most_lost` is the share of samples that gaps may take; `mapping`
     corrects the columns; `accelerometer` is False where the specific force is an estimator's; `named_by`
-    is the mapping that they were read by already. Raises `InputError` for anything that cannot be analysed.
+    is the mapping that they were read by already; `rates` are the true ones (Hz) of columns that were interpolated
+    onto the clock. Raises `InputError` for anything that cannot be analysed.
     """
     origin = str(path)
     columns = {name: column for name, column in columns.items() if name not in left_out(mapping)}
@@ -103,7 +105,9 @@ def assemble(
         **agreed.columns,  # type: ignore[arg-type]
         flying=in_air[agreed.keep],
         accelerometer=accelerometer and "specific_force" in given,
-        sensor_rate=agreed.rates.get("specific_force" if "specific_force" in given else "velocity"),
+        sensor_rate={**(rates or {}), **agreed.rates}.get(
+            "specific_force" if "specific_force" in given else "velocity"
+        ),
         origin=origin,
         data_hash=hashlib.sha256(path.read_bytes()).hexdigest(),
         notes=(*said, *agreed.notes, *(c.text for c in checks[len(agreed.checks) :] if c.verdict == "weak")),

@@ -22,7 +22,8 @@ from trueflight.models.vehicle import Vehicle, load_vehicle
 TABLES = (".csv", ".txt", ".tsv", ".parquet", ".pq")
 RECORDS = (".mcap",)
 ULOGS = (".ulg", ".ulog")
-ENDINGS = (*RECORDS, *TABLES, *ULOGS)
+DATAFLASH = (".bin",)
+ENDINGS = (*RECORDS, *TABLES, *ULOGS, *DATAFLASH)
 """Best first: of files of a folder that differ in their ending only, the first of these is read."""
 
 
@@ -72,6 +73,12 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Give
         from trueflight.groundstation.reading.ulog import read_ulog
 
         return read_ulog(path, _vehicle(path, vehicle), corrections, sources)
+    if suffix in DATAFLASH:
+        from trueflight.groundstation.reading.ardupilot_log import load_dataflash
+        from trueflight.groundstation.reading.px4_flight import flight_of
+
+        refuse_topics(sources, path)
+        return flight_of(path, load_dataflash(path), _vehicle(path, vehicle), corrections)
     if suffix not in TABLES:
         raise InputError(f"{path}: '{suffix}' is no kind of flight file; known are {', '.join(ENDINGS)}")
     refuse_topics(sources, path)
@@ -113,7 +120,7 @@ def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:
         return load_vehicle(beside)
     draft = (
         f"; `groundstation import {path} --draft-vehicle {path.with_name('vehicle.toml')}` drafts one"
-        if path.suffix.lower() in ULOGS
+        if path.suffix.lower() in (*ULOGS, *DATAFLASH)
         else ""
     )
     raise InputError(

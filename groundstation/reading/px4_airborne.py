@@ -45,11 +45,13 @@ def airborne(log: Log) -> tuple[Airborne, list[str]]:
         ("quaternion", "vehicle_attitude"),
         ("quaternion", "vehicle_odometry"),
         ("specific_force", "sensor_combined"),
+        *([("specific_force", "vehicle_acceleration")] if log.filtered else []),
     )
     needed = [topic for what, name in names if (topic := log.of(what).topic(name)) is not None]
     if not needed:
         raise InputError(
-            f"{origin}: neither vehicle_attitude nor sensor_combined is in the log (cut short?); {log.advice}"
+            f"{origin}: neither {log.name_of('vehicle_attitude')} nor {log.name_of('sensor_combined')} is in the log "
+            f"(cut short?); {log.advice}"
         )
     begin, end = max(t.t[0] for t in needed), min(t.t[-1] for t in needed)
     notes: list[str] = []
@@ -83,10 +85,11 @@ def airborne(log: Log) -> tuple[Airborne, list[str]]:
     in_air = armed & ~landed
     if not np.any(in_air):
         raise InputError(
-            f"{origin}: armed for {armed.sum() / RATE:.0f} s but never off the ground (vehicle_land_detected); take "
+            f"{origin}: armed for {armed.sum() / RATE:.0f} s but never off the ground "
+            f"({log.name_of('vehicle_land_detected')}); take "
             "the log of a flight"
         )
-    if armed[-1]:
+    if armed[-1] and is_armed[-1]:  # a logger that stops when it disarms ends a moment before
         notes.append("the log ends while armed: it may be cut short")
     flights = runs(in_air, round(AROUND * RATE))
     if len(flights) > 1:
@@ -126,6 +129,8 @@ def check_multirotor(log: Log) -> None:
 
 def motor_count(log: Log) -> int:
     """How many motors the vehicle has, as far as the log tells; 4 otherwise."""
+    if log.frame is not None:
+        return log.frame.count
     if (count := log.parameter("CA_ROTOR_COUNT")) and count >= 3:
         return int(count)
     status = log.topic("vehicle_status", "system_type")

@@ -28,24 +28,22 @@ from trueflight.groundstation.reading.px4_log import Log, Topic
 from trueflight.groundstation.reading.px4_motion import attitude_of, motion_of
 from trueflight.groundstation.reading.px4_resets import without_resets
 from trueflight.groundstation.reading.px4_thrust import commanded_thrust, motor_commands, rotor_speeds
+from trueflight.groundstation.reading.sources import COLLECTIVE
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.frames import flu_from_frd
 from trueflight.models.vehicle import Vehicle
 
-MODES = {0: "manual", 1: "altitude", 2: "position", 3: "mission", 4: "hold", 5: "return", 6: "position slow",
-         10: "acro", 12: "descend", 13: "termination", 14: "offboard", 15: "stabilized", 17: "takeoff", 18: "land",
-         19: "follow", 20: "precision land", 21: "orbit"}  # fmt: skip
-"""`vehicle_status.nav_state` by name."""
 XYZ = ("xyz[0]", "xyz[1]", "xyz[2]")
 ACCELEROMETER = tuple(f"accelerometer_m_s2[{i}]" for i in range(3))
 GYROSCOPE = tuple(f"gyro_rad[{i}]" for i in range(3))
 PAUSE = 0.25
 """s; a topic that is silent for longer, and for six of its periods, was not recorded: nothing is made up across."""
-FAST = 0.4 * RATE
-"""Hz; a sensor must be this fast."""
+FAST, FILTERED = 0.4 * RATE, 0.2 * RATE
+"""Hz; a sensor must be this fast, and half of it will do for one that was filtered before it was logged: what is above
+is not in it (ArduPilot's `INS_ACCEL_FILTER`, 10 or 20 Hz)."""
 AFFECTS_THRUST = ("THR_MDL_FAC", "MC_BAT_SCALE_EN", "MPC_THR_CURVE", "PWM_", "DSHOT_MIN", "UAVCAN_EC_M", "CA_ROTOR",
-                  "SIH_", "MC_AIRMODE")  # fmt: skip
+                  "SIH_", "MC_AIRMODE", "MOT_PWM_M", "MOT_SPIN_M", "MOT_THST_EXPO", "MOT_BAT_VOLT")  # fmt: skip
 
 
 def flight_of(path: Path, log: Log, vehicle: Vehicle, mapping: Mapping | None = None) -> Flight:
@@ -74,10 +72,14 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle, mapping: Mapping | None = 
     columns |= inertial
     lost += sources
     notes += said
+    slow = min((rate for t in sources if (rate := t.rate_within(*air.span)) < FAST), default=None)
+    if slow is not None:
+        notes[-1] += f", logged at {slow:.0f} Hz and interpolated; {log.faster}"
     if "specific_force" not in columns and not {"position", "velocity"} & set(columns):
         raise InputError(
-            f"{log.origin}: neither an accelerometer of {FAST:.0f} Hz (sensor_combined) nor a valid estimate of the "
-            f"velocity is in the log: nothing was measured that thrust could be compared with; {log.advice}"
+            f"{log.origin}: neither an accelerometer of {_least(log):.0f} Hz ({log.name_of('sensor_combined')}) nor a "
+            "valid estimate of the velocity is in the log: nothing was measured that thrust could be compared with; "
+            f"{log.advice}"
         )
     commands, said = _commands(log, air, vehicle)
     columns |= commands
@@ -103,6 +105,7 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle, mapping: Mapping | None = 
         notes=tuple(notes),
         most_lost=1.0,  # what was not recorded is told, and what is left is whole
         mapping=mapping,
+        rates={} if slow is None else {"specific_force": slow},
     )
 
 
@@ -111,14 +114,16 @@ def _heading(log: Log, air: Airborne) -> list[str]:
     notes = []
     if log.version or log.hardware:
         notes.append(
-            " ".join(word for word in ("PX4", log.version, log.hardware and f"on {log.hardware}") if word)
+            " ".join(
+                word for word in (log.autopilot, log.version, log.hardware and f"on {log.hardware}") if word
+            )
         )
     status = log.topic("vehicle_status", "nav_state")
     if status is not None:
         modes = held(status.t, np.asarray(status.fields["nav_state"]), air.clock)[air.in_air]
         seconds = {int(mode): np.sum(modes == mode) / RATE for mode in np.unique(modes)}
         said = [
-            f"{MODES.get(mode, f'mode {mode}')} {whole_seconds(seconds[mode] * RATE)}"
+            f"{log.modes.get(mode, f'mode {mode}')} {whole_seconds(seconds[mode] * RATE)}"
             for mode in sorted(seconds, key=lambda mode: -seconds[mode])
             if seconds[mode] >= 1.0
         ]
@@ -142,34 +147,55 @@ def _inertial(log: Log, air: Airborne) -> tuple[dict[str, np.ndarray], list[Topi
     out: dict[str, np.ndarray] = {}
     used: list[Topic] = []
     notes: list[str] = []
-    first, last = air.span
 
     def fast(quantity: str, name: str, *fields: str) -> Topic | None:
         topic = log.of(quantity).topic(name, *fields)
-        if topic is None or (rate := topic.rate_within(first, last)) >= FAST:
+        if topic is None or (rate := topic.rate_within(*air.span)) >= _least(log):
             return topic
         if quantity in log.chosen:
             raise InputError(
-                f"{log.origin}: {topic.name}, chosen for {quantity}, was logged at {rate:.0f} Hz, and {FAST:.0f} Hz "
-                "are needed; choose another topic (--topic)"
+                f"{log.origin}: {topic.name}, chosen for {quantity}, was logged at {rate:.0f} Hz, and "
+                f"{_least(log):.0f} Hz are needed; choose another topic (--topic)"
             )
         return None
 
     if (raw := fast("specific_force", "sensor_combined", *ACCELEROMETER)) is not None:
-        out["specific_force"] = flu_from_frd(period_mean(raw.t, raw.stack(*ACCELEROMETER), air.clock))
+        out["specific_force"] = _sensed(log, raw, ACCELEROMETER, air)
         used.append(raw)
     elif (filtered := fast("specific_force", "vehicle_acceleration", *XYZ)) is not None:
-        out["specific_force"] = flu_from_frd(period_mean(filtered.t, filtered.stack(*XYZ), air.clock))
+        out["specific_force"] = _sensed(log, filtered, XYZ, air)
         used.append(filtered)
         if "specific_force" not in log.chosen:
-            notes.append("the accelerometer is PX4's filtered vehicle_acceleration")
+            notes.append(
+                f"the accelerometer is {log.autopilot}'s filtered {log.name_of('vehicle_acceleration')}"
+            )
     else:
-        notes.append(f"no accelerometer of {FAST:.0f} Hz or more in the log (sensor_combined)")
+        notes.append(
+            f"no accelerometer of {_least(log):.0f} Hz or more in the log ({log.name_of('sensor_combined')})"
+        )
     if (rates := fast("angular_velocity", "vehicle_angular_velocity", *XYZ)) is not None:
-        out["angular_velocity"] = flu_from_frd(period_mean(rates.t, rates.stack(*XYZ), air.clock))
+        out["angular_velocity"] = _sensed(log, rates, XYZ, air)
     elif (gyro := fast("angular_velocity", "sensor_combined", *GYROSCOPE)) is not None:
-        out["angular_velocity"] = flu_from_frd(period_mean(gyro.t, gyro.stack(*GYROSCOPE), air.clock))
+        out["angular_velocity"] = _sensed(log, gyro, GYROSCOPE, air)
     return out, used, notes
+
+
+def _tellers(log: Log) -> list[str]:
+    """What could tell the thrust, as the log would call it."""
+    return list(dict.fromkeys(log.name_of(topic) for topic in COLLECTIVE))
+
+
+def _least(log: Log) -> float:
+    """Hz that a sensor of this log must have."""
+    return FILTERED if log.filtered else FAST
+
+
+def _sensed(log: Log, topic: Topic, fields: tuple[str, ...], air: Airborne) -> np.ndarray:
+    """A sensor's columns (N, 3) on the clock, FLU: means over its periods, or, where those are longer, in between."""
+    values = topic.stack(*fields)
+    if topic.rate_within(*air.span) >= FAST:
+        return flu_from_frd(period_mean(topic.t, values, air.clock))
+    return flu_from_frd(np.stack([np.interp(air.clock, topic.t, c) for c in values.T], -1))
 
 
 def _commands(log: Log, air: Airborne, vehicle: Vehicle) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -181,8 +207,7 @@ def _commands(log: Log, air: Airborne, vehicle: Vehicle) -> tuple[dict[str, np.n
     thrust = commanded_thrust(log.of("thrust_command"), first, last, count)
     if thrust is None:
         raise InputError(
-            f"{log.origin}: no thrust command in the log (vehicle_thrust_setpoint, actuator_controls_0, "
-            f"vehicle_rates_setpoint, actuator_motors, actuator_outputs, esc_status); {log.advice}"
+            f"{log.origin}: no thrust command in the log ({', '.join(_tellers(log))}); {log.advice}"
         )
     values = np.where(armed, np.nan_to_num(_interpolated(thrust.t, thrust.values, clock)), 0.0)
     notes = [f"thrust is {thrust.said}, logged at {thrust.rate:.0f} Hz"]
@@ -205,7 +230,7 @@ def _commands(log: Log, air: Airborne, vehicle: Vehicle) -> tuple[dict[str, np.n
     if vehicle.rotor_positions and len(vehicle.rotor_positions) != count:
         notes.append(
             f"{count} motors flew, and the vehicle file has {len(vehicle.rotor_positions)} rotor_positions: correct "
-            "them (--draft-vehicle writes those of CA_ROTOR*)"
+            "them (--draft-vehicle writes what the log tells of them)"
         )
     rates = log.of("body_rate_command").topic("vehicle_rates_setpoint", "roll", "pitch", "yaw")
     if rates is not None and rates.rate_within(first, last) >= 0.2 * RATE:

@@ -45,7 +45,15 @@ TOPICS = (
     "vehicle_status",
     "vehicle_thrust_setpoint",
 )
+Fields = dict[str, np.ndarray]
+"""Columns (M,) of a topic by name, `timestamp` in us among them."""
+MODES = {0: "manual", 1: "altitude", 2: "position", 3: "mission", 4: "hold", 5: "return", 6: "position slow",
+         10: "acro", 12: "descend", 13: "termination", 14: "offboard", 15: "stabilized", 17: "takeoff", 18: "land",
+         19: "follow", 20: "precision land", 21: "orbit"}  # fmt: skip
+"""PX4's `vehicle_status.nav_state` by name."""
 DAY = 86_400_000_000  # us
+BETWEEN_FLIGHTS = 5.0
+"""s without a sample from which on a topic was not recorded, rather than slow."""
 SANE = {
     "vehicle_thrust_setpoint": 2.0,
     "vehicle_rates_setpoint": 200.0,
@@ -78,9 +86,11 @@ class Topic:
         return 1.0 / float(np.median(np.diff(self.t)))
 
     def rate_within(self, first: float, last: float) -> float:
-        """Samples per second between two times, Hz."""
+        """Samples per second between two times, Hz; what lies between flights, unrecorded, does not lower it."""
         inside = np.searchsorted(self.t, [first, last])
-        return float(inside[1] - inside[0]) / max(last - first, 1e-9)
+        pauses = np.diff(self.t[slice(*inside)])
+        unrecorded = float(pauses[pauses > BETWEEN_FLIGHTS].sum())
+        return float(inside[1] - inside[0]) / max(last - first - unrecorded, 1e-9)
 
     def stack(self, *names: str) -> np.ndarray:
         """Fields as columns (M, k)."""
@@ -97,10 +107,26 @@ class Topic:
 
 
 @dataclass(frozen=True)
+class Frame:
+    """The rotors of a vehicle: how many, by which parameters, and where those tell it: `places` in FLU in proportions
+    (arms of one), and `turns`, 1 for counter-clockwise from above."""
+
+    count: int
+    source: str
+    places: tuple[tuple[float, ...], ...] = ()
+    turns: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
 class Log:
     """A log: the instances of each topic by name, parameters at its start, their later changes (time in s, name,
     value), and what the file itself had to tell. `advice` says how to record what is missing, `faster` how to record
-    more of it. `chosen` are the topics that were asked for, by quantity."""
+    more of it. `chosen` are the topics that were asked for, by quantity.
+
+    The log of another autopilot is brought to PX4's topics: `autopilot` and its flight `modes` by number, `names` of
+    what it calls these topics, its `frame`, and whether its sensors were `filtered` before they were logged, so that
+    slower samples of them alias nothing.
+    """
 
     origin: str
     topics: dict[str, tuple[Topic, ...]]
@@ -112,6 +138,15 @@ class Log:
     advice: str = "log with PX4's default profile (SDLOG_PROFILE 1)"
     faster: str = "SDLOG_PROFILE 3 logs manoeuvres faster"
     chosen: dict[str, Topic] = field(default_factory=dict)
+    autopilot: str = "PX4"
+    modes: dict[int, str] = field(default_factory=lambda: MODES)
+    names: dict[str, str] = field(default_factory=dict)
+    frame: Frame | None = None
+    filtered: bool = False
+
+    def name_of(self, topic: str) -> str:
+        """What the log itself calls a topic of PX4."""
+        return self.names.get(topic, topic)
 
     def of(self, quantity: str) -> Log:
         """The log as a quantity is to be read from it: where a topic was chosen for it, without those that compete."""

@@ -18,7 +18,7 @@ def attitude_of(log: Log, air: Airborne) -> tuple[np.ndarray, list[str]]:
     """Attitude (N, 4), body FLU to world ENU, on the clock. Raises `InputError` for a log without one."""
     topic = log.topic("vehicle_attitude", *ATTITUDE) or log.topic("vehicle_odometry", *ATTITUDE)
     if topic is None:
-        raise InputError(f"{log.origin}: vehicle_attitude is not in the log; {log.advice}")
+        raise InputError(f"{log.origin}: {log.name_of('vehicle_attitude')} is not in the log; {log.advice}")
     q = topic.stack(*ATTITUDE)
     good = np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.02
     if good.sum() < 2:

@@ -86,13 +86,19 @@ def _sources(log: Log, first: float, last: float, count: int) -> Iterator[Thrust
             continue
         values, said = _battery_scaled(log, topic, values)
         good = np.isfinite(values)
-        yield Thrust(topic.t[good], values[good], f"{name}{said}", topic.rate_within(first, last))
+        yield Thrust(
+            topic.t[good], values[good], f"{log.name_of(name)}{said}", topic.rate_within(first, last)
+        )
     for motors in _motors(log, first, last, count):
         yield Thrust(motors.t, motors.commands.mean(axis=1), f"the mean of {motors.said}", motors.rate)
     if (esc := rotor_speeds(log, first, last, count)) is not None:
         t, speed, rate = esc
         yield Thrust(
-            t, np.mean(speed**2, axis=1), "the squared rotor speeds of esc_status", rate, relative=True
+            t,
+            np.mean(speed**2, axis=1),
+            f"the squared rotor speeds of {log.name_of('esc_status')}",
+            rate,
+            relative=True,
         )
 
 
@@ -119,7 +125,12 @@ def _motors(log: Log, first: float, last: float, count: int) -> Iterator[Motors]
         flown = known & (topic.t >= first) & (topic.t <= last)
         if np.any(commands[flown] > 0):
             # Motors that stand have no command (nan); they give no thrust.
-            yield Motors(topic.t, np.nan_to_num(commands), "actuator_motors", topic.rate_within(first, last))
+            yield Motors(
+                topic.t,
+                np.nan_to_num(commands),
+                log.name_of("actuator_motors"),
+                topic.rate_within(first, last),
+            )
     for topic in log.topics.get("actuator_outputs", ()):
         yield from _outputs(log, topic, first, last, count)
 

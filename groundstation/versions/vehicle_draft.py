@@ -1,18 +1,20 @@
-"""A vehicle file drafted from the log of a PX4 vehicle: what its parameters and its flight tell, and what they do not.
+"""A vehicle file drafted from the log of a vehicle: what its parameters and its flight tell, and what they do not.
 
-PX4 needs neither mass nor propeller, so it knows neither; geometry it needs only up to its scale. A draft says of each
-value where it is from, and marks what its owner has to weigh, measure or check.
+Autopilots need neither mass nor propeller, so they know neither; geometry they need only up to its scale. A draft says
+of each value where it is from, and marks what its owner has to weigh, measure or check.
 """
 
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from trueflight.groundstation.reading.flight_file import ULOGS
+from trueflight.groundstation.reading.ardupilot_log import load_dataflash
+from trueflight.groundstation.reading.flight_file import DATAFLASH, ULOGS
 from trueflight.groundstation.reading.px4_airborne import (
     RATE,
     Airborne,
@@ -23,7 +25,7 @@ from trueflight.groundstation.reading.px4_airborne import (
     motor_count,
     period_mean,
 )
-from trueflight.groundstation.reading.px4_flight import ACCELEROMETER, FAST
+from trueflight.groundstation.reading.px4_flight import ACCELEROMETER, FAST, FILTERED, XYZ
 from trueflight.groundstation.reading.px4_log import Log, load_ulog
 from trueflight.groundstation.reading.px4_thrust import commanded_thrust
 from trueflight.models.errors import InputError
@@ -39,7 +41,16 @@ SETTLED = 3.0  # s of slow flight from which a hover thrust is measured
 PROPELLER = 0.45
 """Radius of a propeller in distances of neighbouring rotors, usual for a quadrotor whose propellers nearly touch."""
 GAINS = ("MC_ROLLRATE_P", "MC_ROLLRATE_I", "MC_ROLLRATE_D", "MC_ROLLRATE_K", "MC_ROLLRATE_MAX",
-         "MC_YAWRATE_P", "MC_YAWRATE_MAX")  # fmt: skip
+         "MC_YAWRATE_P", "MC_YAWRATE_MAX", "ATC_RAT_RLL_P", "ATC_RAT_RLL_I", "ATC_RAT_RLL_D",
+         "ATC_RAT_YAW_P")  # fmt: skip
+
+
+NAMED = "give it your own name (it is part of Zenoh keys)"
+LOADERS: dict[str, Callable[[Path], Log]] = {
+    **dict.fromkeys(ULOGS, load_ulog),
+    **dict.fromkeys(DATAFLASH, load_dataflash),
+}
+"""What reads the logs that hold parameters, by their ending."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +81,8 @@ class Draft:
 
 
 def draft_vehicle(log: Log, mass: float | None = None) -> Draft:
-    """The vehicle of a PX4 log, as far as the log tells; `mass` in kg as its owner weighed it. Raises `InputError` for
-    the log of anything but a multirotor."""
+    """The vehicle of an autopilot's log, as far as it tells; `mass` in kg as its owner weighed it. Raises `InputError`
+    for the log of anything but a multirotor."""
     check_multirotor(log)
     try:
         air, _ = airborne(log)
@@ -93,14 +104,18 @@ def draft_vehicle(log: Log, mass: float | None = None) -> Draft:
 
 
 def draft_of(file: Path, target: Path, mass: float | None = None) -> Draft:
-    """The vehicle drafted from the PX4 log `file`, not yet written at `target`. Raises `InputError` for another kind of
+    """The vehicle drafted from the log `file`, not yet written at `target`. Raises `InputError` for another kind of
     file, and where `target` is there already."""
 
-    if file.suffix.lower() not in ULOGS:
-        raise InputError(f"{file}: only a PX4 ULog holds the parameters that a vehicle file is drafted from")
+    load = LOADERS.get(file.suffix.lower())
+    if load is None:
+        raise InputError(
+            f"{file}: only an autopilot's log ({', '.join(LOADERS)}) holds the parameters that a vehicle file is "
+            "drafted from"
+        )
     if target.exists():
         raise InputError(f"{target}: there is a file already; a draft never replaces one, name another")
-    log = load_ulog(file)
+    log = load(file)
     with unreadable(file, "the log", "copy it from the vehicle's card again"):
         return draft_vehicle(log, mass)
 
@@ -113,10 +128,13 @@ def write_draft(draft: Draft, path: Path) -> None:
 
 
 def _name(log: Log) -> Line:
+    if log.frame is not None:
+        name = log.autopilot.lower()
+        return Line("name", f'"{name}"', "", f"{log.frame.source}; {NAMED}")
     airframe = log.parameter("SYS_AUTOSTART")
     name = f"px4-{airframe:.0f}" if airframe else "px4"
     source = f"SYS_AUTOSTART {airframe:.0f}" if airframe else "the log names no airframe"
-    return Line("name", f'"{name}"', "", f"{source}; give it your own name (it is part of Zenoh keys)")
+    return Line("name", f'"{name}"', "", f"{source}; {NAMED}")
 
 
 def _mass(log: Log, mass: float | None, simulated: bool) -> Line:
@@ -126,8 +144,8 @@ def _mass(log: Log, mass: float | None, simulated: bool) -> Line:
         return Line("mass", _number(log.parameters["SIH_MASS"]), "kg", "SIH_MASS, the simulated vehicle's")
     return Line(
         "mass", _number(STAND_IN_MASS), "kg",
-        "NOT KNOWN TO PX4, a stand-in: WEIGH the vehicle with its battery. Accelerations do not depend on it, all "
-        "forces in newtons do", complete=False,
+        f"NOT KNOWN TO {log.autopilot.upper()}, a stand-in: WEIGH the vehicle with its battery. Accelerations do "
+        "not depend on it, all forces in newtons do", complete=False,
     )  # fmt: skip
 
 
@@ -141,7 +159,7 @@ def _inertia(log: Log, simulated: bool) -> tuple[Line, ...]:
             "inertia",
             "[0.0, 0.0, 0.0]",
             "kg m^2",
-            "not known to PX4; only effects of torques need it",
+            f"not known to {log.autopilot}; only effects of torques need it",
             False,
             False,
         ),
@@ -152,12 +170,22 @@ def _rotors(log: Log, simulated: bool) -> tuple[Line, ...]:
     count = motor_count(log)
     keys = [f"CA_ROTOR{i}_{axis}" for i in range(count) for axis in ("PX", "PY", "PZ", "KM")]
     found = [log.parameter(key) for key in keys]
-    radius = Line("rotor_radius", "0.1", "m", "not known to PX4: MEASURE, half a propeller's diameter", False)
+    unknown = f"not known to {log.autopilot}"
+    radius = Line("rotor_radius", "0.1", "m", f"{unknown}: MEASURE, half a propeller's diameter", False)
+    if log.frame is not None and log.frame.places:
+        return (
+            radius,
+            Line("rotor_positions", _rows(np.array(log.frame.places)), "m, FLU",
+                 f"{log.frame.source}: their directions, on arms of a metre: MEASURE", False, False),
+            Line("rotor_directions", str(list(log.frame.turns)), "1: counter-clockwise from above", log.frame.source,
+                 True, False),
+        )  # fmt: skip
     if any(value is None for value in found):
         airframe = log.parameter("SYS_AUTOSTART")
         why = (
-            f"the log does not tell where its {count} motors are (CA_ROTOR*): MEASURE, one row a motor"
-            if count != 4
+            f"the log does not tell where its {count} motors are ({log.frame.source if log.frame else 'CA_ROTOR*'}): "
+            "MEASURE, one row a motor"
+            if count != 4 or log.frame is not None
             else "not in the log: before 1.13 a mixer file stands for it "
             f"(SYS_AUTOSTART {airframe or 0:.0f}, MAV_TYPE {log.parameter('MAV_TYPE') or 0:.0f}): MEASURE. Shown is "
             "the order of PX4's quad-x: front right, rear left, front left, rear right"
@@ -195,7 +223,7 @@ def _rotors(log: Log, simulated: bool) -> tuple[Line, ...]:
         return radius, where, turning
     radius = Line(
         "rotor_radius", _number(float(f"{PROPELLER * min(gaps):.2g}")), "m",
-        f"not known to PX4: MEASURE, half a propeller's diameter ({min(gaps) / 2:.2g} m would touch the neighbour)",
+        f"{unknown}: MEASURE, half a propeller's diameter ({min(gaps) / 2:.2g} m would touch the neighbour)",
         False,
     )  # fmt: skip
     return (
@@ -207,9 +235,12 @@ def _rotors(log: Log, simulated: bool) -> tuple[Line, ...]:
 
 
 def _thrust(log: Log, air: Airborne | None) -> tuple[Line, ...]:
-    believed = log.parameter("MPC_THR_HOVER")
-    said = f"MPC_THR_HOVER is {believed:g}" if believed is not None else "the log holds no MPC_THR_HOVER"
-    factor = log.parameter("THR_MDL_FAC")
+    hovering, bent = (
+        ("MPC_THR_HOVER", "THR_MDL_FAC") if log.frame is None else ("MOT_THST_HOVER", "MOT_THST_EXPO")
+    )
+    believed = log.parameter(hovering)
+    said = f"{hovering} is {believed:g}" if believed is not None else f"the log holds no {hovering}"
+    factor = log.parameter(bent)
     cells = next((n for p in ("BAT1_N_CELLS", "BAT_N_CELLS") if (n := log.parameter(p) or 0) > 0), 0)
     hover, how = _hover(log, air)
     estimate = _estimate(log, air)
@@ -219,21 +250,23 @@ def _thrust(log: Log, air: Airborne | None) -> tuple[Line, ...]:
     elif estimate is not None:
         hover, source = estimate, f"hover_thrust_estimate, median in the air; {said}"
     elif believed is not None:
-        hover, source = believed, "MPC_THR_HOVER: what PX4 was told, not what was flown"
+        hover, source = believed, f"{hovering}: what {log.autopilot} was told, not what was flown"
     else:
         hover, source = 0.5, f"{said}, nor a flight: a stand-in, FLY A HOVER"
     curve = Line(
         "thrust_model", '"linear"', "",
-        "what PX4 assumes of this command"
-        + (f", with THR_MDL_FAC {factor:g}" if factor else
-           f"; {'the log holds no THR_MDL_FAC' if factor is None else 'THR_MDL_FAC is 0'}, real propellers are nearer "
+        f"what {log.autopilot} assumes of this command"
+        + (f", with {bent} {factor:g}" if factor else
+           f"; {f'the log holds no {bent}' if factor is None else f'{bent} is 0'}, real propellers are nearer "
            'to "quadratic": the effect thrust_curve tells'),
     )  # fmt: skip
     voltage = None
     if air is not None and (battery := battery_in_use(log, air)[0]) is not None:
         flown = (battery.t >= air.span[0]) & (battery.t <= air.span[1])
         voltage = float(np.median(np.asarray(battery.fields["voltage_v"])[flown]))
-    capacity = next((c for p in ("BAT1_CAPACITY", "BAT_CAPACITY") if (c := log.parameter(p) or 0) > 0), 0)
+    capacity = next(
+        (c for p in ("BAT1_CAPACITY", "BAT_CAPACITY", "BATT_CAPACITY") if (c := log.parameter(p) or 0) > 0), 0
+    )
     pack = ", ".join(
         word
         for word in (f"{cells:.0f} cells" if cells else "", f"{capacity:.0f} mAh" if capacity else "")
@@ -276,10 +309,13 @@ def _hover(log: Log, air: Airborne | None) -> tuple[float | None, str]:
         slow = rows & (speed < SLOW) & (height - ground_level(height, air)[0] > CLEAR)
     if slow.sum() < SETTLED * RATE:
         return None, ""
-    felt = log.topic("sensor_combined", *ACCELEROMETER)
-    if felt is None or felt.rate_within(*air.span) < FAST:
+    fields = ACCELEROMETER
+    felt = log.topic("sensor_combined", *fields)
+    if felt is None and log.filtered:
+        felt, fields = log.topic("vehicle_acceleration", *XYZ), XYZ
+    if felt is None or felt.rate_within(*air.span) < (FILTERED if log.filtered else FAST):
         return float(np.median(command[slow])), f"median command of {slow.sum() / RATE:.0f} s of slow flight"
-    force = -float(np.median(period_mean(felt.t, felt.stack(*ACCELEROMETER), air.clock)[slow, 2]))
+    force = -float(np.median(period_mean(felt.t, felt.stack(*fields), air.clock)[slow, 2]))
     if not 0.5 * GRAVITY < force < 2.0 * GRAVITY:
         return None, ""
     hover = float(np.median(command[slow])) * GRAVITY / force
@@ -303,10 +339,12 @@ def _dynamics(log: Log, simulated: bool) -> tuple[Line, ...]:
     motor = (
         Line("motor_time_constant", _number(lag), "s", "SIH_T_TAU, the simulated motors'")
         if lag
-        else Line("motor_time_constant", "0.0", "s", "not known to PX4; the effect motor_lag tells")
+        else Line(
+            "motor_time_constant", "0.0", "s", f"not known to {log.autopilot}; the effect motor_lag tells"
+        )
     )
     return (
-        Line("command_delay", "0.0", "s", "not known to PX4; the effect transport_delay tells"),
+        Line("command_delay", "0.0", "s", f"not known to {log.autopilot}; the effect transport_delay tells"),
         motor,
         Line(
             "rate_time_constant",
@@ -318,7 +356,9 @@ def _dynamics(log: Log, simulated: bool) -> tuple[Line, ...]:
 
 
 def _text(log: Log, lines: tuple[Line, ...]) -> str:
-    words = " ".join(word for word in ("PX4", log.version, log.hardware and f"on {log.hardware}") if word)
+    words = " ".join(
+        word for word in (log.autopilot, log.version, log.hardware and f"on {log.hardware}") if word
+    )
     missing = [line.key for line in lines if not line.complete]
     head = [
         f"# Drafted from {Path(log.origin).name} ({words}), world ENU, body FLU, SI units.",

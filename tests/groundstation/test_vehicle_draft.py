@@ -126,4 +126,4 @@ def test_where_the_flight_cannot_be_written_there_is_no_draft_either(tmp_path):
 def test_a_csv_has_no_parameters_to_draft_from(tmp_path):
     (tmp_path / "flight.csv").write_text("t,x\n0,1\n")
     done = groundstation("import", tmp_path / "flight.csv", "--draft-vehicle", tmp_path / "v.toml")
-    assert done.returncode == 2 and "only a PX4 ULog" in done.stderr
+    assert done.returncode == 2 and "only an autopilot's log" in done.stderr
