@@ -9,18 +9,10 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from trueflight.groundstation.commands.linked import linked
 from trueflight.groundstation.commands.options import (
-    CfgOption,
-    ConfigOption,
-    ConnectOption,
     ControllerOption,
     JsonOption,
-    KeysOption,
-    ListenOption,
-    ModeOption,
-    NameOption,
-    TimeoutOption,
-    ZenohOption,
 )
 from trueflight.groundstation.output.terminal import print_warning
 from trueflight.models.errors import InputError
@@ -28,6 +20,7 @@ from trueflight.models.printed import print_json_line
 
 if TYPE_CHECKING:
     from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.settings import Settings
     from trueflight.models.database import Collection, Sortie
 
 console = Console()
@@ -36,7 +29,7 @@ console = Console()
 def register(app: typer.Typer) -> None:
     """Add this command to the ground station's application."""
     app.command("collect", epilog="Example: groundstation collect --seed 1 --minutes 30 -o database")(
-        collect_command
+        linked(collect_command)
     )
 
 
@@ -50,15 +43,8 @@ def collect_command(
     patience: Annotated[
         float, typer.Option(help="s to wait on the ground for a companion that refuses.", min=0.0)
     ] = 60.0,
-    config: ConfigOption = None,
-    name: NameOption = None,
-    connect: ConnectOption = None,
-    mode: ModeOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ZenohOption = None,
-    cfg: CfgOption = None,
-    timeout: TimeoutOption = None,
-    keys: KeysOption = None,
+    *,
+    settings: Settings,
     as_json: JsonOption = False,
 ) -> None:
     """Fly a whole training database through the companion and fetch each record: translations, steps, rotations,
@@ -69,17 +55,12 @@ def collect_command(
     """
     from trueflight.groundstation.operate.link import Link
     from trueflight.groundstation.operate.mission import check_controller
-    from trueflight.groundstation.operate.settings import settings_with
     from trueflight.models.database import Collection, database, record_name
 
     check_controller(controller)
     sorties = {
         record_name(number, sortie): sortie for number, sortie in enumerate(database(seed, minutes), 1)
     }
-    settings = settings_with(
-        config, name=name, connect=connect, mode=mode, listen=listen, zenoh_config=zenoh_config, cfg=cfg,
-        timeout=timeout, keys=keys,
-    )  # fmt: skip
     with Link(settings) as link:
         print_warning(link.warning)
         asked = {"vehicle": link.vehicle, "seed": seed, "minutes": minutes, "controller": controller}

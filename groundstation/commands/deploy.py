@@ -10,17 +10,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from trueflight.groundstation.commands.linked import linked
 from trueflight.groundstation.commands.options import (
-    CfgOption,
-    ConfigOption,
-    ConnectOption,
     JsonOption,
-    KeysOption,
-    ListenOption,
-    ModeOption,
-    NameOption,
-    TimeoutOption,
-    ZenohOption,
 )
 from trueflight.groundstation.output.terminal import print_event, print_warning
 from trueflight.models.errors import InputError
@@ -28,6 +20,7 @@ from trueflight.models.printed import print_json_line
 
 if TYPE_CHECKING:
     from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.settings import Settings
     from trueflight.models.record_pb2 import Event
 
 console = Console()
@@ -39,7 +32,7 @@ def register(app: typer.Typer) -> None:
         "deploy",
         epilog="Example: groundstation deploy quad5-v3.onnx --shadow 5 --wait, and to take it back: "
         "groundstation deploy --roll-back",
-    )(deploy_command)
+    )(linked(deploy_command))
 
 
 def deploy_command(
@@ -56,15 +49,8 @@ def deploy_command(
     roll_back: Annotated[
         bool, typer.Option("--roll-back", help="Go back to the model before the live one, also in flight.")
     ] = False,
-    config: ConfigOption = None,
-    name: NameOption = None,
-    connect: ConnectOption = None,
-    mode: ModeOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ZenohOption = None,
-    cfg: CfgOption = None,
-    timeout: TimeoutOption = None,
-    keys: KeysOption = None,
+    *,
+    settings: Settings,
     as_json: JsonOption = False,
 ) -> None:
     """Send a model to the companion, which checks it and lets it prove itself, or says why not.
@@ -76,15 +62,10 @@ def deploy_command(
     """
     from trueflight.groundstation.operate.deployment import read_onnx
     from trueflight.groundstation.operate.link import Link
-    from trueflight.groundstation.operate.settings import settings_with
 
     if roll_back and (model is not None or shadow is not None):
         raise InputError("--roll-back goes back to the previous model; leave the file and --shadow out")
     onnx = b"" if roll_back else read_onnx(model)
-    settings = settings_with(
-        config, name=name, connect=connect, mode=mode, listen=listen, zenoh_config=zenoh_config, cfg=cfg,
-        timeout=timeout, keys=keys,
-    )  # fmt: skip
     with Link(settings) as link:
         print_warning(link.warning)
         vehicle = link.vehicle

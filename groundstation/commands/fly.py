@@ -11,18 +11,10 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from trueflight.groundstation.commands.linked import linked
 from trueflight.groundstation.commands.options import (
-    CfgOption,
-    ConfigOption,
-    ConnectOption,
     ControllerOption,
     JsonOption,
-    KeysOption,
-    ListenOption,
-    ModeOption,
-    NameOption,
-    TimeoutOption,
-    ZenohOption,
 )
 from trueflight.groundstation.output.terminal import print_event, print_warning
 from trueflight.models.errors import InputError
@@ -30,6 +22,7 @@ from trueflight.models.printed import print_json, print_json_line
 
 if TYPE_CHECKING:
     from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.settings import Settings
     from trueflight.models.record_pb2 import Event
 
 console = Console()
@@ -39,7 +32,7 @@ def register(app: typer.Typer) -> None:
     """Add this command to the ground station's application."""
     app.command(
         "fly", epilog="Example: groundstation fly lemniscate --set speed=2 --controller corrected --wait"
-    )(fly_command)
+    )(linked(fly_command))
 
 
 def fly_command(
@@ -55,15 +48,8 @@ def fly_command(
         bool, typer.Option("--wait", help="Follow the flight to its end and fetch its record.")
     ] = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder for the record.")] = None,
-    config: ConfigOption = None,
-    name: NameOption = None,
-    connect: ConnectOption = None,
-    mode: ModeOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ZenohOption = None,
-    cfg: CfgOption = None,
-    timeout: TimeoutOption = None,
-    keys: KeysOption = None,
+    *,
+    settings: Settings,
     as_json: JsonOption = False,
 ) -> None:
     """Ask the companion to fly a trajectory; with --wait, follow it and fetch the flight record."""
@@ -72,13 +58,8 @@ def fly_command(
         return
     from trueflight.groundstation.operate.link import Link
     from trueflight.groundstation.operate.mission import mission_of
-    from trueflight.groundstation.operate.settings import settings_with
 
     mission = mission_of(trajectory, controller, parameters or (), repeat)
-    settings = settings_with(
-        config, name=name, connect=connect, mode=mode, listen=listen, zenoh_config=zenoh_config, cfg=cfg,
-        timeout=timeout, keys=keys,
-    )  # fmt: skip
     with Link(settings) as link:
         print_warning(link.warning)
         if wait:

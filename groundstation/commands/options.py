@@ -70,29 +70,6 @@ JobsOption = Annotated[int, typer.Option(help="Flights at a time; 0: one for eac
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 SaveOption = Annotated[Path | None, typer.Option("--save", "--rrd", help="Write a Rerun recording here.")]
 
-# --- the way to a companion -----------------------------------------------------------------------------------------
-
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="Settings (groundstation.toml); flags override it.")
-]
-NameOption = Annotated[
-    str | None, typer.Option("--name", help="Vehicle; default: the only one that answers.")
-]
-ConnectOption = Annotated[
-    list[str] | None, typer.Option("-e", "--connect", help="Zenoh endpoint of the companion.")
-]
-ModeOption = Annotated[str | None, typer.Option("-m", "--mode", help="Zenoh mode: peer, client, router.")]
-ListenOption = Annotated[
-    list[str] | None, typer.Option("-l", "--listen", help="Zenoh endpoint to listen on.")
-]
-ZenohOption = Annotated[Path | None, typer.Option("-c", "--zenoh-config", help="Zenoh configuration file.")]
-CfgOption = Annotated[list[str] | None, typer.Option("--cfg", help="Zenoh setting, KEY:VALUE.")]
-TimeoutOption = Annotated[
-    float | None, typer.Option("--timeout", help="Seconds to wait for an answer.", min=0.1)
-]
-KeysOption = Annotated[
-    Path | None, typer.Option("--keys", help="Your folder of `groundstation keys`: TLS, and what you may do.")
-]
 ControllerOption = Annotated[
     str, typer.Option(help=f"One of {', '.join(CONTROLLERS)}; corrected needs a deployed model.")
 ]

@@ -9,23 +9,15 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from trueflight.groundstation.commands.linked import linked
 from trueflight.groundstation.commands.options import (
-    CfgOption,
-    ConfigOption,
-    ConnectOption,
     JsonOption,
-    KeysOption,
-    ListenOption,
-    ModeOption,
-    NameOption,
-    TimeoutOption,
-    ZenohOption,
 )
 from trueflight.groundstation.output.terminal import print_warning
 from trueflight.models.printed import print_json
 
 if TYPE_CHECKING:
-    pass
+    from trueflight.groundstation.operate.settings import Settings
 
 console = Console()
 
@@ -33,9 +25,9 @@ console = Console()
 def register(app: typer.Typer) -> None:
     """Add these commands to the ground station's application."""
     app.command("status", epilog="Example: groundstation status -e tcp/192.168.1.7:7447 --json")(
-        status_command
+        linked(status_command)
     )
-    app.command("monitor", epilog="Example: groundstation monitor --save flight.rrd")(monitor_command)
+    app.command("monitor", epilog="Example: groundstation monitor --save flight.rrd")(linked(monitor_command))
 
 
 def _position(position: dict[str, Any]) -> str:
@@ -58,25 +50,13 @@ def _mocap(pose: dict[str, Any]) -> str:
 
 
 def status_command(
-    config: ConfigOption = None,
-    name: NameOption = None,
-    connect: ConnectOption = None,
-    mode: ModeOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ZenohOption = None,
-    cfg: CfgOption = None,
-    timeout: TimeoutOption = None,
-    keys: KeysOption = None,
+    *,
+    settings: Settings,
     as_json: JsonOption = False,
 ) -> None:
     """What the companion is doing, and whether it could fly now."""
     from trueflight.groundstation.operate.link import Link
-    from trueflight.groundstation.operate.settings import settings_with
 
-    settings = settings_with(
-        config, name=name, connect=connect, mode=mode, listen=listen, zenoh_config=zenoh_config, cfg=cfg,
-        timeout=timeout, keys=keys,
-    )  # fmt: skip
     with Link(settings) as link:
         status = link.status()
         records = link.records()
@@ -152,25 +132,13 @@ def monitor_command(
     seconds: Annotated[
         float | None, typer.Option("--seconds", help="Stop after this long; default: until Ctrl-C.", min=0.1)
     ] = None,
-    config: ConfigOption = None,
-    name: NameOption = None,
-    connect: ConnectOption = None,
-    mode: ModeOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ZenohOption = None,
-    cfg: CfgOption = None,
-    timeout: TimeoutOption = None,
-    keys: KeysOption = None,
+    *,
+    settings: Settings,
 ) -> None:
     """Watch a vehicle live in Rerun: path, reference, commands, correction, guard, latency."""
     from trueflight.groundstation.operate.link import Link
-    from trueflight.groundstation.operate.settings import settings_with
     from trueflight.groundstation.views import monitor
 
-    settings = settings_with(
-        config, name=name, connect=connect, mode=mode, listen=listen, zenoh_config=zenoh_config, cfg=cfg,
-        timeout=timeout, keys=keys,
-    )  # fmt: skip
     with Link(settings) as link:
         print_warning(link.warning)
         console.print(f"watching '{link.vehicle}'; Ctrl-C ends", highlight=False)
