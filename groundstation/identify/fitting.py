@@ -18,10 +18,11 @@ from typing import Protocol
 import numpy as np
 from scipy import special
 
+from trueflight.groundstation.identify.noisy_inputs import without_noise
 from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Value, Values, cut_at, held, number
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.models.effect import Effect, Motion, Parameter, Stage
-from trueflight.models.effects import CLOCK, effect_named
+from trueflight.models.effects import CLOCK, catalogue, effect_named
 from trueflight.models.model import Model, Term
 from trueflight.models.prediction import Chain, apply_effects, motion_of_flight, specific_force
 from trueflight.models.vehicle import Vehicle
@@ -156,7 +157,8 @@ class MeasuredFlights:
     @cached_property
     def motions(self) -> tuple[Motion, ...]:
         """Each flight as effects see it, before any of them acts."""
-        return tuple(motion_of_flight(m.flight) for m in self.measurements)
+        noisy = {n for e in catalogue(self.effects_directory).values() for n in e.noisy}
+        return tuple(motion_of_flight(without_noise(m.flight, noisy)) for m in self.measurements)
 
     @cached_property
     def flight_of_rows(self) -> np.ndarray:

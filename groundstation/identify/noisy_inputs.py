@@ -1,88 +1,63 @@
 """Effects whose regressor is a noisy measurement itself: least squares finds them too small, unless its noise is taken
-off.
+off first.
 
 An accelerometer's lever arm goes with the derivative of the gyroscope, whose noise adds to the regressor's own energy
-and explains nothing. What it adds is seen by adding as much once more: the columns of the effect with a second,
-made-up noise of the size that the log shows, less those without. That energy is taken off the normal equations
-(corrected least squares: Fuller, Measurement Error Models, 1987, ch. 1.2 and 2.2).
+and explains nothing. Each such column is replaced by the best linear estimate of what it measures: every frequency is
+kept by the part of its power that is not noise (Wiener). What an estimate of this kind leaves out is uncorrelated with
+the estimate, so that least squares on it is no longer attenuated (regression calibration: Carroll, Ruppert, Stefanski &
+Crainiceanu, Measurement Error in Nonlinear Models, 2nd ed., 2006, ch. 4).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from trueflight.groundstation.identify.fitting import Fit, MeasuredFlights, half_width
-from trueflight.groundstation.identify.force import ForceProblem
-from trueflight.groundstation.identify.search import whole
-from trueflight.groundstation.measured.measurement import Measurement
-from trueflight.models.model import Term
+from trueflight.models.flight import Flight
 
-MOST = 0.5
-"""Part of a regressor's energy that may be noise: beyond, the correction is as uncertain as the effect."""
-
-
-def without_attenuation(problem: ForceProblem, here: Fit, names: Sequence[str]) -> Fit:
-    """The fit `here` with those effects of `names` that read noisy columns as large as they are without that noise."""
-    noisy = [n for n in names if problem.effects[n].noisy and here.sizes(n)]
-    if not noisy:
-        return here
-    count = len(here.free)
-    added = np.zeros((count, count))
-    for name in noisy:
-        own, columns = here.sizes(name), problem.effects[name].noisy
-        louder = replace(
-            problem,
-            flights=MeasuredFlights(
-                tuple(_louder(m, columns) for m in problem.flights.measurements),
-                problem.flights.effects_directory,
-                problem.flights.always,
-            ),
-        )
-        choice = whole(problem.effects[name])
-        more = louder.contribution(here, choice) - problem.contribution(here, choice)
-        free = [here.free[i] for i in own]
-        more = more / np.array([f.parameter.typical - f.neutral for f in free])
-        added[np.ix_(own, own)] = more.T @ more
-    flat = here.jacobian.reshape(-1, count)
-    normal = flat.T @ flat
-    if np.any(np.diag(added) > MOST * np.diag(normal)):
-        return here
-    prior = np.diag([0.0 if f.flat else problem.unit() / f.spread**2 for f in here.free])
-    size = here.estimate - np.array([f.neutral for f in here.free])
-    undone = np.linalg.pinv(normal - added + prior, hermitian=True)
-    step = undone @ added @ size
-    turn = undone @ (normal + prior)
-    covariance = turn @ here.covariance @ turn.T
-    moved = replace(
-        here,
-        estimate=here.estimate + step,
-        covariance=covariance,
-        residual=here.residual + here.jacobian @ step,
-    )
-    return replace(moved, terms=tuple(_term(moved, t) for t in here.terms))
+SMOOTHING = 0.05
+"""Width of the band over which power is averaged, as a part of its frequency."""
+NARROWEST = 8
+"""Frequencies of the mirrored flight on either side that are averaged at least."""
+SURE = 2.0
+"""Standard deviations by which averaged power must be above the noise to be kept."""
 
 
-def _louder(m: Measurement, columns: Sequence[str]) -> Measurement:
-    """The measurement of a flight with as much white noise once more on these columns as they have, the same every
-    time."""
-    rng = np.random.default_rng(0)
-    changes = {}
-    for name in columns:
-        column = m.flight.column(name)
-        # third differences leave motion alone, and the median is deaf to shocks
-        sigma = np.median(np.abs(np.diff(column, n=3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
-        changes[name] = column + sigma * rng.normal(size=column.shape)
-    return replace(m, flight=replace(m.flight, **changes))
+def without_noise(flight: Flight, columns: Iterable[str]) -> Flight:
+    """The flight with its columns of these names as the best linear estimate of what they measure."""
+    changes: dict[str, Any] = {name: _estimated(flight.column(name)) for name in columns if flight.has(name)}
+    return replace(flight, **changes)
 
 
-def _term(fitted: Fit, term: Term) -> Term:
-    """The term with the values and intervals of the fit."""
-    values, intervals = dict(term.values), dict(term.intervals)
-    for i in fitted.of(term.effect):
-        name, value = fitted.free[i].parameter.name, float(fitted.estimate[i])
-        half = half_width(fitted.free[i], value, fitted.covariance[i, i], fitted.critical)
-        values[name], intervals[name] = value, (value - half, value + half)
-    return replace(term, values=values, intervals=intervals)
+def _estimated(column: np.ndarray) -> np.ndarray:
+    """Columns (N, k) without the white noise that their third differences show: these leave motion alone, and the
+    median is deaf to shocks."""
+    n = len(column)
+    sigma = np.median(np.abs(np.diff(column, n=3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
+    # mirrored, so that both ends meet
+    both = np.concatenate([column, column[::-1]])
+    spectrum = np.fft.rfft(both, axis=0)
+    count = _averaged(len(spectrum))
+    power = np.apply_along_axis(_smoothed, 0, np.abs(spectrum) ** 2)
+    # what is averaged is itself uncertain, and noise alone must not be kept where it happens to be strong
+    noise = 2.0 * n * sigma**2 * (1.0 + SURE / np.sqrt(count))[:, None]
+    kept = np.clip(1.0 - noise / np.maximum(power, 1e-30), 0.0, 1.0)
+    kept[0] = 1.0
+    return np.asarray(np.fft.irfft(spectrum * kept, n=2 * n, axis=0)[:n])
+
+
+def _averaged(count: int) -> np.ndarray:
+    """Frequencies of the flight over which each of `count` of the mirrored one's is averaged, (F,)."""
+    return np.maximum(NARROWEST, (0.5 * SMOOTHING * np.arange(count)).astype(int)).astype(float)
+
+
+def _smoothed(power: np.ndarray) -> np.ndarray:
+    """Power (F,) averaged over a band that widens with the frequency."""
+    sums = np.concatenate([[0.0], np.cumsum(power)])
+    k = np.arange(len(power))
+    half = _averaged(len(power)).astype(int)
+    low, high = np.maximum(k - half, 0), np.minimum(k + half + 1, len(power))
+    return np.asarray((sums[high] - sums[low]) / (high - low))

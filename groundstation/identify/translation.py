@@ -20,7 +20,6 @@ from trueflight.groundstation.identify.fitting import (
     model_of,
 )
 from trueflight.groundstation.identify.force import ForceProblem, mean_square_before
-from trueflight.groundstation.identify.noisy_inputs import without_attenuation
 from trueflight.groundstation.identify.rates import judge_rates
 from trueflight.groundstation.identify.remainder import unexplained
 from trueflight.groundstation.identify.ridges import ridges, with_ridges
@@ -132,7 +131,7 @@ def _spread(flight: Flight, bandwidth: float | None) -> tuple[Measurement, ...]:
 def _report(search: Search, found: State, everything: Search, rotation: RotationalFindings) -> Diagnosis:
     """The verdicts; figures of what was found are those of the whole flight, which `everything` sees."""
     problem, entire = _force(search), _force(everything)
-    here = without_attenuation(entire, everything.state(found.choices).fit, found.names)
+    here = everything.state(found.choices).fit
     m, base = entire.flights.measurements[0], entire.base
     remains = unexplained(m, here.residual)
     doubt = Weighing(entire, here, m.noise[list(m.axes)]) if remains.misfit else None
