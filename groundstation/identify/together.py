@@ -21,7 +21,6 @@ from trueflight.groundstation.identify.fitting import Fit, MeasuredFlights, mode
 from trueflight.groundstation.identify.force import MATERIAL_ACCELERATION, mean_square_before
 from trueflight.groundstation.identify.joint_force import JointForce, plain
 from trueflight.groundstation.identify.joint_torque import JointTorque, one_choice_each
-from trueflight.groundstation.identify.noisy_inputs import without_attenuation
 from trueflight.groundstation.identify.ownership import BY_FILE, Ownership
 from trueflight.groundstation.identify.rates import judge_rates
 from trueflight.groundstation.identify.remainder import unexplained
@@ -284,7 +283,7 @@ class _Joint:
         shared: tuple[SharedNumber, ...],
     ) -> Diagnosis:
         entire = _joint(everything)
-        here = without_attenuation(entire, everything.state(found.choices).fit, found.names)
+        here = everything.state(found.choices).fit
         each = [self._one(entire, here, rotation, k) for k in range(len(self.all))]
         noise = np.sqrt(np.mean([m.noise[list(m.axes)] ** 2 for m in entire.flights.measurements], axis=0))
         left_over = _together([f.unexplained for f in each], self.names)
