@@ -25,6 +25,8 @@ NOTHING = "nothing"
 SURE = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
 """Edges of the bins of the reliability diagram."""
 CALLED_SURE = 0.95
+ON_TIME = 2.0
+"""s within which the moment of a change is told rightly."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Estimated:
 
 @dataclass(frozen=True)
 class Said:
-    """What the diagnosis said of one effect of one flight."""
+    """What the diagnosis said of one effect of one flight; `moments` are those at which it changes, s."""
 
     name: str
     verdict: str
@@ -64,6 +66,7 @@ class Said:
     estimates: tuple[Estimated, ...] = ()
     seen_in: str = "acceleration"
     confidence: float | None = None
+    moments: tuple[float, ...] = ()
 
     @property
     def error(self) -> float | None:
@@ -80,6 +83,8 @@ class Case:
     """One flight of known truth: `truth` the names of what was hidden, `said` the verdict on each effect.
 
     RMS in m/s² (rad/s² in the rotation). `error` says why there is no diagnosis, and is empty where there is one.
+    `begins` tells when an effect begins that does so in flight, s; `strength` is the factor on the usual sizes, `late`
+    the lag of the estimate, s, and `rate` the log's, Hz.
     """
 
     number: int
@@ -96,6 +101,10 @@ class Case:
     error: str = ""
     controller: str = ""
     vehicle: str = ""
+    begins: dict[str, float] = field(default_factory=dict)
+    strength: float = 1.0
+    late: float = 0.0
+    rate: float = 100.0
 
     def of(self, name: str) -> Said | None:
         """What was said of one effect."""
@@ -126,6 +135,27 @@ class Case:
     def false(self, verdict: str) -> tuple[str, ...]:
         """Effects named with this verdict that neither are true nor stand for what is."""
         return tuple(s.name for s in self.named() if s.verdict == verdict and not self.stands(s))
+
+    def untimed(self) -> tuple[str, ...]:
+        """Effects that begin in flight, named without the moment (within `ON_TIME`)."""
+        named = {s.name: s for s in self.named()}
+        return tuple(
+            name
+            for name, moment in self.begins.items()
+            if name in named and all(abs(told - moment) > ON_TIME for told in named[name].moments)
+        )
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the explanation is wrong or incomplete: something false is called missing, something hidden denied,
+        or named without the moment at which it begins."""
+        return not self.honest or bool(self.untimed())
+
+    @property
+    def flagged(self) -> bool:
+        """Whether the diagnosis says that its explanation is not all there is: something is unexplained or only
+        possible."""
+        return self.unexplained or any(s.verdict == POSSIBLE for s in self.named())
 
     def excitation(self, said: Said) -> float:
         """What the effect changes, RMS, over the noise floor of where it is seen."""
@@ -223,6 +253,9 @@ class Reliability:
 
     bins: tuple[Bin, ...]
     called_sure: Proportion
+    brier: float
+    """Mean squared difference between how sure a verdict is and whether it is right (1 or 0); NaN where there is
+    none."""
 
 
 @dataclass(frozen=True)
@@ -253,6 +286,10 @@ class Calibration:
     """Flights with nothing hidden in which an effect is called missing or possible, or something is unexplained."""
     false_effects: Proportion
     """Flights of all kinds in which an effect that is not there is called missing."""
+    unflagged: Proportion
+    """Flights with a wrong or incomplete explanation in which nothing is unexplained or only possible."""
+    timed: Proportion
+    """Effects that begin in flight and are named, with the moment."""
     confusion: tuple[Row, ...]
     coverage: tuple[Coverage, ...]
     claims: int
@@ -280,6 +317,10 @@ def calibrate(cases: Sequence[Case]) -> Calibration:
         false_alarm=proportion(bool(c.false(MISSING)) for c in empty),
         doubt=proportion(bool(c.named()) or c.unexplained for c in empty),
         false_effects=proportion(bool(c.false(MISSING)) for c in good),
+        unflagged=proportion(c.wrong and not c.flagged for c in good),
+        timed=proportion(
+            name not in c.untimed() for c in good for name in c.begins if name in {s.name for s in c.named()}
+        ),
         confusion=confusion(good),
         coverage=coverage(good),
         claims=len(claims),
@@ -295,6 +336,10 @@ GROUPS: dict[str, Callable[[Case], str]] = {
     "kind of flight": lambda c: c.kind,
     "noise": lambda c: f"{c.noise:g} times",
     "rotor speeds": lambda c: "with" if c.rotor_speeds else "without",
+    "size": lambda c: f"{c.strength:g} of the usual" if c.truth else "nothing hidden",
+    "begins in flight": lambda c: "one" if c.begins else "none",
+    "estimate": lambda c: "late" if c.late else "in time",
+    "log": lambda c: f"{c.rate:g} Hz",
 }
 
 
@@ -331,9 +376,12 @@ def _count(names: Iterable[str]) -> dict[str, int]:
 def coverage(cases: Sequence[Case]) -> tuple[Coverage, ...]:
     """Coverage of all intervals of effects that were rightly named (first), then by effect and by parameter.
 
-    Only flights in which all that is hidden was named: what is left out of a model bends the parameters of the rest.
+    Only flights in which all that is hidden was named, with the moment at which it begins: what is left out of a model
+    bends the parameters of the rest.
     """
-    cases = [c for c in cases if all(c.outcome(n) in (MISSING, POSSIBLE) for n in c.truth)]
+    cases = [
+        c for c in cases if all(c.outcome(n) in (MISSING, POSSIBLE) for n in c.truth) and not c.untimed()
+    ]
     found = [(s.name, e, s.error) for c in cases for s in c.named() if s.name in c.truth for e in s.estimates]
     known = [(name, e, error) for name, e, error in found if e.truth is not None]
     rows = [_covered("", "", known)] if known else []
@@ -405,7 +453,8 @@ def reliability(claims: Sequence[Claim]) -> Reliability:
         if inside:
             mean = float(np.mean([c.sure for c in inside]))
             bins.append(Bin(low, high, mean, proportion(c.right for c in inside)))
-    return Reliability(tuple(bins), proportion(c.right for c in claims if c.sure >= CALLED_SURE))
+    brier = float(np.mean([(c.sure - c.right) ** 2 for c in claims])) if claims else math.nan
+    return Reliability(tuple(bins), proportion(c.right for c in claims if c.sure >= CALLED_SURE), brier)
 
 
 # --- what was wrong -------------------------------------------------------------------------------------------------
@@ -433,6 +482,12 @@ def wrongs(case: Case) -> list[Wrong]:
     for name in lost:
         told = case.of(name)
         add(f"missed: {name}, said to be absent (p {told.p_value:.2g})" if told else f"missed: {name}")
+    for name in case.untimed():
+        told = case.of(name)
+        said_when = ", ".join(f"{moment:.1f} s" for moment in told.moments) if told else ""
+        add(f"moment: {name} begins at {case.begins[name]:g} s, told: {said_when or 'no moment'}")
+    if case.wrong and not case.flagged:
+        add("not flagged: wrong or incomplete, and nothing is unexplained or only possible")
     for s in case.named():
         if s.name not in case.truth:
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from rich.console import Console
@@ -41,6 +42,8 @@ def _print_shares(console: Console, result: Calibration) -> None:
         ("an effect that is not there is called missing", result.false_effects),
         ("  in flights with nothing hidden (false alarm)", result.false_alarm),
         ("  or possible, or something is unexplained", result.doubt),
+        ("wrong or incomplete, and nothing says so", result.unflagged),
+        ("of the effects that begin in flight and are named, with the moment", result.timed),
     ):
         table.add_row(name, f"{share.count} of {share.of}", _share(share))
     console.print(table)
@@ -106,6 +109,7 @@ def _print_certainty(console: Console, result: Calibration) -> None:
             table.add_row(name if k == 0 else "", edges, str(one.right.of), _share(one.right))
         sure = found.called_sure
         table.add_row("", "[bold]95 % or more[/bold]", str(sure.of), _share(sure))
+        table.add_row("", "Brier score", "", "–" if math.isnan(found.brier) else f"{found.brier:.4f}")
         table.add_section()
     console.print(table)
 

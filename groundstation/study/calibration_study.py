@@ -38,8 +38,18 @@ from trueflight.models.vehicle import GRAVITY, Vehicle, load_vehicle
 from trueflight.models.whole_file import write_whole
 from trueflight.models.workers import interrupts_held, worker_pool
 
-SHARES = {0: 0.3, 1: 0.4, 2: 0.2, 3: 0.1}
+SHARES = {0: 0.3, 1: 0.3, 2: 0.2, 3: 0.1, 4: 0.1}
 """Share of the flights with so many effects hidden in them."""
+STRENGTHS = (0.25, 0.5, 1.0, 1.0)
+"""Factors on the usual sizes of what is hidden, a quarter of the flights each."""
+BEGINS = 0.5, (0.3, 0.75)
+"""Of flights with an effect that may begin in flight, the share in which one does, and within which parts of it."""
+LATE = 0.2, (0.03, 0.09)
+"""Share of the flights whose position and velocity are logged through a first-order lag, and its time constants, s."""
+RATES = {100.0: 0.8, 25.0: 0.2}
+"""Share of the flights that are logged at so many Hz."""
+DRAWN = 2
+"""Which draws these are: with others a seed flies other flights, so that a folder does not go on with them."""
 NOISE = (1.0, 2.0)
 """Scales of the sensors' noise, half of the flights each."""
 LENGTHS = (0.5, 1.0, 1.0, 1.5)
@@ -66,7 +76,8 @@ EVENTS = ("payload", "estimator_delay")
 @dataclass(frozen=True)
 class Sortie:
     """One flight of a study, before it is flown: `number` from 1, `seed` of the simulator, `rotor_speeds` whether its
-    record has them."""
+    record has them; one effect `begins` so many s after take-off, by name; its log has `rate` rows a second and an
+    estimate `late` by so many s."""
 
     number: int
     seed: int
@@ -77,6 +88,10 @@ class Sortie:
     charge: float
     controller: str
     rotor_speeds: bool
+    strength: float
+    begins: dict[str, float]
+    late: float
+    rate: float
 
     @property
     def name(self) -> str:
@@ -87,7 +102,8 @@ class Sortie:
 @dataclass(frozen=True)
 class Study:
     """A folder of flights: the files of vehicle and design, `seed` of all draws, `seconds` of a flight of usual length,
-    `names` of the effects that may be hidden, `strength` the factor on their sizes."""
+    `names` of the effects that may be hidden, `beginners` those that may begin in flight, `strength` a factor on all
+    sizes."""
 
     folder: Path
     vehicle: Path
@@ -96,13 +112,16 @@ class Study:
     seconds: float
     names: tuple[str, ...]
     strength: float = 1.0
+    beginners: tuple[str, ...] = ()
 
     def settings(self) -> dict[str, Any]:
         """All that the flights depend on, but their number."""
         return {
+            "drawn": DRAWN,
             "seed": self.seed,
             "seconds": self.seconds,
             "effects": list(self.names),
+            "beginners": list(self.beginners),
             "strength": self.strength,
             "vehicle": self.vehicle.read_text(encoding="utf-8"),
             "design": self.design.read_text(encoding="utf-8"),
@@ -151,14 +170,19 @@ def study_of(
         raise InputError(
             f"{believed}: no design to fly by; make one: groundstation design {vehicle}, or pass --design"
         )
-    return Study(folder, vehicle, believed, seed, seconds, hideable(), strength)
+    may_begin = hideable()
+    beginners = tuple(name for name, begins in may_begin.items() if begins)
+    return Study(folder, vehicle, believed, seed, seconds, tuple(may_begin), strength, beginners)
 
 
-def hideable() -> tuple[str, ...]:
-    """Names that the simulator can hide and the catalogue knows; asks `sim-bridge effects`."""
+def hideable() -> dict[str, bool]:
+    """Names that the simulator can hide and the catalogue knows, with whether they may begin in flight; asks
+    `sim-bridge effects`."""
     told = run_json(["sim-bridge", "effects", "--json"])["effects"]
     known = catalogue()
-    return tuple(row["name"] for row in told if row["name"] in known and row["name"] not in EVENTS)
+    return {
+        row["name"]: row["may_begin"] for row in told if row["name"] in known and row["name"] not in EVENTS
+    }
 
 
 def sorties(study: Study, count: int) -> tuple[Sortie, ...]:
@@ -190,12 +214,12 @@ def sorties(study: Study, count: int) -> tuple[Sortie, ...]:
         hidden = deal(min(tens.pop(), len(names)))
         # in the simulator's order, for there a later effect may act on what an earlier one has made of the thrust
         ordered = tuple(sorted(hidden, key=names.index))
-        found.append(_sortie(generator, number, ordered, study.seconds, integral))
+        found.append(_sortie(generator, number, ordered, study, integral))
     return tuple(found)
 
 
 def _sortie(
-    generator: random.Random, number: int, hidden: tuple[str, ...], seconds: float, integral: bool
+    generator: random.Random, number: int, hidden: tuple[str, ...], study: Study, integral: bool
 ) -> Sortie:
     (kind,) = generator.choices(list(KINDS), list(KINDS.values()))
     descends = generator.random() < 0.7
@@ -203,16 +227,27 @@ def _sortie(
         kind = "descent"  # no other flight can show it
     if _shown_in(BELOW_CEILING, hidden) and kind == "descent":
         kind = "survey"  # it would begin above the ceiling
+    seconds = study.seconds * generator.choice(LENGTHS)
+    share, (early, by_then) = BEGINS
+    able = [name for name in hidden if name in study.beginners]
+    changing = generator.random() < share
+    moment = round(seconds * generator.uniform(early, by_then), 1)
+    lags, (least, most) = LATE
+    lag = round(generator.uniform(least, most), 3)
     return Sortie(
         number=number,
         seed=generator.randrange(2**31),
         hidden=hidden,
         kind=kind,
-        seconds=seconds * generator.choice(LENGTHS),
+        seconds=seconds,
         noise=generator.choice(NOISE),
         charge=round(generator.uniform(*CHARGE), 3),
         controller=generator.choice(CONTROLLERS if integral else CONTROLLERS[:1]),
         rotor_speeds=generator.random() < 0.5,
+        strength=generator.choice(STRENGTHS),
+        begins={generator.choice(able): moment} if able and changing else {},
+        late=lag if generator.random() < lags else 0.0,
+        rate=generator.choices(list(RATES), list(RATES.values()))[0],
     )
 
 
@@ -319,10 +354,11 @@ def command_of(study: Study, sortie: Sortie) -> list[str]:
     words: list[object] = ["sim-bridge", "fly", "--trajectory", f"{stem}.setpoints.csv"]
     words += ["--vehicle", study.vehicle, "--design", study.design]
     for name in sortie.hidden or ("none",):
-        words += ["--hidden", name]
+        at = f"@{sortie.begins[name]}" if name in sortie.begins else ""
+        words += ["--hidden", f"{name}{at}"]
     words += [
         "--strength",
-        study.strength,
+        study.strength * sortie.strength,
         "--seed",
         sortie.seed,
         "--noise",
@@ -368,7 +404,7 @@ def diagnose_record(study: Study, sortie: Sortie) -> dict[str, Any]:
     """Diagnose a record as any flight, or tell what was found before; its failure is told under "error"."""
     from trueflight.groundstation.identify.translation import diagnose
     from trueflight.groundstation.output.as_json import diagnosis_table
-    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.study.logged import read_logged
     from trueflight.models.model import rigid_body_model
 
     kept = (study.folder / sortie.name).with_suffix(".diagnosis.json")
@@ -377,7 +413,8 @@ def diagnose_record(study: Study, sortie: Sortie) -> dict[str, Any]:
         return told
     begin = time.perf_counter()
     try:
-        flight = read_flight((study.folder / sortie.name).with_suffix(".mcap"))
+        record = (study.folder / sortie.name).with_suffix(".mcap")
+        flight = read_logged(record, sortie.late, sortie.rate)
         told = diagnosis_table(diagnose(flight, rigid_body_model(flight.vehicle)))
     except Exception as error:  # noqa: BLE001 - one flight that ends in an error is a finding, not the end
         told = {"error": f"{type(error).__name__}: {error}"}

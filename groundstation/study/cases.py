@@ -15,6 +15,7 @@ def case_from_table(flown: Mapping[str, Any], diagnosis: Mapping[str, Any] | Non
     finished)."""
     sortie = flown["sortie"]
     hidden = truth_of(flown["hidden"], vehicle)
+    begins = begins_of(flown["hidden"], tuple(hidden))
     error = "" if diagnosis is None else str(diagnosis.get("error", ""))
     case = Case(
         number=sortie["number"],
@@ -26,6 +27,10 @@ def case_from_table(flown: Mapping[str, Any], diagnosis: Mapping[str, Any] | Non
         error=error,
         controller=sortie["controller"],
         vehicle=flown["vehicle"],
+        begins=begins,
+        strength=sortie["strength"],
+        late=sortie["late"],
+        rate=sortie["rate"],
     )
     if diagnosis is None or error:
         return case
@@ -64,6 +69,19 @@ def truth_of(hidden: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> dict[str,
     return true
 
 
+def begins_of(hidden: Sequence[Mapping[str, Any]], true: Sequence[str]) -> dict[str, float]:
+    """When effects begin that do so in flight, s after take-off; what an effect brings along begins with it."""
+    begins = {h["name"]: float(h["begins"]["value"]) for h in hidden if "begins" in h}
+    known = catalogue()
+    here = {h["name"] for h in hidden}
+    for name, moment in list(begins.items()):
+        brought = (
+            [n for n in known[name].acts_through if n in true and n not in here] if name in known else []
+        )
+        begins |= dict.fromkeys(brought, moment)
+    return begins
+
+
 def _said(row: Mapping[str, Any], true: Mapping[str, float]) -> Said:
     estimates = tuple(
         Estimated(name, p["value"], p["low"], p["high"], true.get(name))
@@ -79,4 +97,5 @@ def _said(row: Mapping[str, Any], true: Mapping[str, float]) -> Said:
         estimates=estimates,
         seen_in=row.get("seen_in", "acceleration"),
         confidence=row.get("confidence"),
+        moments=tuple(change["time"] for change in (row.get("over_time") or {}).get("changes", [])),
     )

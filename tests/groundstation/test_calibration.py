@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from json_schemas import valid
 from simulated import VEHICLE
@@ -30,10 +31,21 @@ from trueflight.groundstation.evaluate.calibration import (
 )
 from trueflight.groundstation.output.as_json import calibration_table
 from trueflight.groundstation.report.calibration import CHARTS, render_calibration
-from trueflight.groundstation.study.calibration_study import TOP, Study, hideable, path_of, setpoints, sorties
-from trueflight.groundstation.study.cases import truth_of
+from trueflight.groundstation.study.calibration_study import (
+    STRENGTHS,
+    TOP,
+    Study,
+    command_of,
+    hideable,
+    path_of,
+    setpoints,
+    sorties,
+)
+from trueflight.groundstation.study.cases import begins_of, truth_of
+from trueflight.groundstation.study.logged import lagged, thinned
 from trueflight.models.effects import catalogue
 from trueflight.models.errors import run_command_line
+from trueflight.models.flight import Flight
 from trueflight.models.reference import trajectory_from_csv
 from trueflight.models.vehicle import load_vehicle
 from trueflight.sim_bridge.truth.effects import EFFECTS
@@ -152,6 +164,40 @@ def test_a_flight_that_was_not_finished_or_not_diagnosed_is_told_and_not_counted
     assert [w.why for w in result.wrong] == ["ValueError: no"]
 
 
+def test_an_effect_that_begins_in_flight_is_explained_only_with_the_moment() -> None:
+    def begun(moments: tuple[float, ...], **more) -> Case:
+        told = said("rotor_drag", MISSING, 1, 0.0, (), moments=moments)
+        return case(1, ("rotor_drag",), told, begins={"rotor_drag": 40.0}, **more)
+
+    on_time, late, untold = begun((41.0,)), begun((20.0, 44.0)), begun(())
+    assert [c.untimed() for c in (on_time, late, untold)] == [(), ("rotor_drag",), ("rotor_drag",)]
+    assert [c.wrong for c in (on_time, late, untold)] == [False, True, True]
+    doubted = begun((), unexplained=True)
+    assert (doubted.wrong, doubted.flagged) == (True, True)
+    result = calibrate([on_time, late, untold, doubted])
+    assert (result.timed.count, result.timed.of) == (1, 4)
+    assert (result.unflagged.count, result.unflagged.of) == (2, 4)
+    assert result.by["begins in flight"]["one"].of == 4
+    assert ["begins at 40 s, told: 20.0 s, 44.0 s" in w.why for w in wrongs(late)] == [True, False]
+    # one that was never named is denied, not untimed
+    assert case(2, ("wind",), begins={"wind": 40.0}).untimed() == ()
+
+
+def test_wrong_explanations_are_flagged_by_what_is_unexplained_or_only_possible() -> None:
+    assert [c.number for c in EVERY if c.wrong] == [3, 4, 8]
+    assert calibrate(EVERY).unflagged.count == 3
+    doubts = [replace(c, unexplained=True) for c in EVERY]
+    assert calibrate(doubts).unflagged.count == 0
+
+
+def test_intervals_of_what_begins_in_flight_count_where_the_moment_is_told() -> None:
+    drag = [Estimated("x", 0.3, 0.2, 0.4, 0.31)]
+    for moments, counted in (((40.5,), 1), ((), 0)):
+        told = said("rotor_drag", MISSING, 1, 0.0, (), drag, moments=moments)
+        flight = case(1, ("rotor_drag",), told, begins={"rotor_drag": 40.0})
+        assert len(calibrate([flight]).coverage) == 2 * counted
+
+
 def test_coverage_and_the_factor_that_intervals_lack() -> None:
     flights = [
         case(
@@ -198,6 +244,8 @@ def test_claims_are_binned_by_how_sure_they_are() -> None:
         (0.95, 0.99, 9, 10),
     ]
     assert (found.called_sure.count, found.called_sure.of) == (9, 10)
+    assert found.brier == pytest.approx((9 * 0.03**2 + 0.97**2 + 3 * 0.3**2) / 13)
+    assert math.isnan(reliability([]).brier)
 
 
 def test_a_group_claims_that_one_of_it_is_there() -> None:
@@ -231,6 +279,16 @@ def test_true_values_are_those_of_the_simulator() -> None:
     assert "rotor_drag" not in truth_of(with_drag, vehicle)
 
 
+def test_what_an_effect_brings_along_begins_with_it() -> None:
+    wind = {"name": "wind", "parameters": {}, "begins": {"value": 40.0, "unit": "s"}}
+    drag, gain = {"name": "rotor_drag", "parameters": {}}, {"name": "thrust_gain", "parameters": {}}
+    assert begins_of([wind, gain], ("wind", "rotor_drag", "thrust_gain")) == {
+        "wind": 40.0,
+        "rotor_drag": 40.0,
+    }
+    assert begins_of([wind, drag], ("wind", "rotor_drag")) == {"wind": 40.0}
+
+
 def test_what_an_effect_calls_its_truth_is_a_number_of_the_simulator() -> None:
     for name, effect in catalogue().items():
         named = {p.truth for p in effect.parameters} | {effect.carrier_truth}
@@ -242,19 +300,31 @@ def test_what_an_effect_calls_its_truth_is_a_number_of_the_simulator() -> None:
 
 @pytest.fixture
 def study(tmp_path: Path) -> Study:
-    return Study(tmp_path, VEHICLE, VEHICLE.with_name("design.json"), 5, 60.0, NAMES)
+    beginners = ("thrust_gain", "rotor_drag", "wind")
+    return Study(tmp_path, VEHICLE, VEHICLE.with_name("design.json"), 5, 60.0, NAMES, beginners=beginners)
 
 
 def test_more_flights_begin_with_the_same_and_hide_everything_equally_often(study: Study) -> None:
     many = sorties(study, 100)
     assert many[:7] == sorties(study, 7)
     counts = [len(s.hidden) for s in many]
-    assert [counts.count(n) for n in range(4)] == [30, 40, 20, 10]
+    assert [counts.count(n) for n in range(5)] == [30, 30, 20, 10, 10]
     hidden = [name for s in many for name in s.hidden]
     assert max(map(hidden.count, NAMES)) - min(map(hidden.count, NAMES)) <= 2
     assert all(len(set(s.hidden)) == len(s.hidden) for s in many)
     assert {s.rotor_speeds for s in many} == {True, False}
     assert sorties(replace(study, seed=6), 7) != many[:7]
+    assert {s.strength for s in many} == set(STRENGTHS)
+    assert {s.rate for s in many} == {100.0, 25.0}
+    late = [s.late for s in many if s.late]
+    assert 10 <= len(late) <= 30 and 0.03 <= min(late) <= max(late) <= 0.09
+    begun = [s for s in many if s.begins]
+    assert len(begun) > 10
+    for s in begun:
+        ((name, moment),) = s.begins.items()
+        assert name in s.hidden and name in study.beginners
+        assert 0.3 * s.seconds - 0.1 <= moment <= 0.75 * s.seconds + 0.1
+        assert f"{name}@{moment}" in command_of(study, s)
 
 
 def test_flights_are_long_enough_and_stay_below_the_ceiling(study: Study) -> None:
@@ -280,6 +350,21 @@ def test_setpoints_are_the_path(study: Study) -> None:
 
 def test_the_simulator_hides_all_of_the_catalogue_but_what_needs_no_parameter_or_has_no_law_there() -> None:
     assert set(catalogue()) - set(hideable()) == {"rigid_body", "axial_inflow"}
+
+
+def test_a_poorer_log_is_late_by_its_lag_and_has_every_other_row() -> None:
+    t = np.arange(1000) * 0.01
+    ramp = np.column_stack([2.0 * t, 0.0 * t + 3.0, -t])
+    flight = Flight("ramp", load_vehicle(VEHICLE), t, position=ramp, thrust_command=t, extra={"note": t})
+    behind = lagged(flight, 0.05)
+    # a first-order lag is late on a ramp by its time constant, less half of a row that is followed at once
+    assert (ramp - behind.position)[-1] == pytest.approx(np.array([2.0, 0.0, -1.0]) * 0.045, abs=1e-3)
+    assert behind.position[0] == pytest.approx(ramp[0])
+    assert behind.velocity is None
+    fewer = thinned(behind, 4)
+    assert len(fewer) == len(fewer.position) == len(fewer.thrust_command) == len(fewer.extra["note"]) == 250
+    assert fewer.t[1] == pytest.approx(0.04)
+    assert lagged(flight, 0.0) is flight
 
 
 def run(capsys, monkeypatch, *arguments) -> tuple[int, str, str]:
