@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -51,7 +52,7 @@ def thinned(flight: Flight, every: int) -> Flight:
     """One row of so many, as a logger keeps them: nothing is filtered before."""
     rows = len(flight)
     columns = {f.name: getattr(flight, f.name) for f in fields(flight)}
-    kept = {
+    kept: dict[str, Any] = {
         name: values[::every]
         for name, values in columns.items()
         if isinstance(values, np.ndarray) and len(values) == rows
