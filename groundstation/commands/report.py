@@ -13,11 +13,13 @@ from trueflight.groundstation.commands.options import (
     BandwidthOption,
     DesignOption,
     EffectsOption,
-    FlightArgument,
+    FlightsArgument,
     JsonOption,
     MappingOption,
     ModelsOption,
+    PerFlightOption,
     SaveOption,
+    SharedOption,
     StoreOption,
     ValidateOption,
     VehicleOption,
@@ -37,7 +39,7 @@ def register(app: typer.Typer) -> None:
 
 
 def report_command(
-    flight: FlightArgument,
+    flight: FlightsArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="The HTML file to write.")] = Path(
         "report.html"
     ),
@@ -49,6 +51,8 @@ def report_command(
     mapping: MappingOption = None,
     model: ModelsOption = None,
     design: DesignOption = None,
+    per_flight: PerFlightOption = None,
+    shared: SharedOption = None,
     without: Annotated[
         list[str] | None, typer.Option("--without", help="Leave this section out. Repeatable.")
     ] = None,
@@ -58,32 +62,36 @@ def report_command(
     save: SaveOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Diagnose a flight and write it as one HTML page, for those who were not there.
+    """Diagnose a flight, or several together, and write it as one HTML page, for those who were not there.
 
     The page needs nothing else, opens offline and prints to PDF. With --model repeated, the diagnosis starts from the
-    last of them, and all are compared side by side. Sections: ranking, waterfall, prediction, where, worst, tracking,
-    side_by_side, blind, provenance.
+    last of them, and all are compared side by side. Sections: ranking, flights, waterfall, prediction, where, worst,
+    tracking, side_by_side, blind, provenance.
     """
-    from trueflight.groundstation.evaluate.analysis import analyse
+    from trueflight.groundstation.evaluate.analysis import gather
     from trueflight.groundstation.evaluate.side_by_side import side_by_side
+    from trueflight.groundstation.identify.flights import diagnose_flights
     from trueflight.groundstation.output.as_json import analysis_table
     from trueflight.groundstation.output.tables import print_diagnosis
-    from trueflight.groundstation.reading import read_flight
-    from trueflight.groundstation.reading.several import read_beside, read_held_out, told_apart
+    from trueflight.groundstation.reading.several import read_beside, read_held_out, read_together, told_apart
     from trueflight.groundstation.report import chosen, render, write_report
     from trueflight.groundstation.versions.choice import choose_design, choose_line, choose_model
 
     sections = chosen(without or ())
-    read = read_flight(flight, vehicle, mapping)
+    together = read_together(flight, vehicle, mapping)
+    read = together[-1]
     held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
-    flights = told_apart([read, *(read_beside(path, read, vehicle, mapping) for path in beside or ())])
+    flights = told_apart([*together, *(read_beside(path, read, vehicle, mapping) for path in beside or ())])
     named = [[choose_model(f, which, store, effects) for which in model or (None,)] for f in flights]
     line = choose_line(read, model[-1] if model else None, store, effects)
     with working(console, "comparing", as_json) as progress:
-        together = side_by_side(flights, named, bandwidth) if len(flights) * len(named[0]) > 1 else None
-        whole = analyse(
-            read, line, held_out, bandwidth, choose_design(read, design), together, progress=progress
+        asked = bool(beside) or len(named[0]) > 1
+        table_of = side_by_side(flights, named, bandwidth) if asked else None
+        progress("looking for missing effects")
+        found = diagnose_flights(
+            together, line[-1], held_out, bandwidth, per_flight or (), shared or (), progress
         )
+        whole = gather(found, line, held_out, bandwidth, choose_design(read, design), table_of, progress)
         progress("drawing")
         table = analysis_table(whole)
         write_report(output, render(whole, table, sections))

@@ -219,8 +219,9 @@ class Diagnosis(results.Diagnosis):
 
     @property
     def params(self) -> dict[str, float]:
-        """Values of what is missing or possible, by `effect.parameter`, in the units that `effects()` tells."""
-        return {f"{e.name}.{p.name}": p.value for e in self._found() for p in e.parameters}
+        """Values of what is missing or possible, by `effect.parameter`, in the units that `effects()` tells; those of
+        one of several flights by `effect.parameter@flight`."""
+        return {_key(e, p): p.value for e in self._found() for p in e.parameters}
 
     @property
     def pvalues(self) -> dict[str, float]:
@@ -229,8 +230,8 @@ class Diagnosis(results.Diagnosis):
         return {e.name: e.p_value for e in self.effects}
 
     def conf_int(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals (low, high) of what is missing or possible, by `effect.parameter`."""
-        return {f"{e.name}.{p.name}": (p.low, p.high) for e in self._found() for p in e.parameters}
+        """95 % intervals (low, high) of what is missing or possible, named as in `params`."""
+        return {_key(e, p): (p.low, p.high) for e in self._found() for p in e.parameters}
 
     def effect(self, name: str) -> results.EffectVerdict:
         """What the flight says of the effect `name`. Raises `InputError` where it was not judged."""
@@ -242,21 +243,33 @@ class Diagnosis(results.Diagnosis):
         return found
 
     def interval(self, effect: str) -> dict[str, tuple[float, float]]:
-        """95 % interval (low, high) of each parameter of an `effect`, found or not, in the parameter's unit.
+        """95 % interval (low, high) of each parameter of an `effect`, found or not, in the parameter's unit; of several
+        flights, those of one flight by `parameter@flight`.
 
         Raises `InputError` where it was not judged.
         """
-        return {p.name: (p.low, p.high) for p in self.effect(effect).parameters}
+        return {_own(p): (p.low, p.high) for p in self.effect(effect).parameters}
 
     def to_pandas(self) -> pd.DataFrame:
-        """One row for each parameter of each effect: verdict, share of the error (0 to 1), p-value, value, low, high
-        and unit, indexed by effect and parameter.
+        """One row for each parameter of each effect: verdict, share of the error (0 to 1), p-value, value, low, high,
+        unit and flight (where it is one's own), indexed by effect and parameter.
 
         Raises `InputError` where pandas is not installed.
         """
-        names = ("effect", "parameter", "verdict", "share", "p_value", "value", "low", "high", "unit")
+        names = (
+            "effect",
+            "parameter",
+            "verdict",
+            "share",
+            "p_value",
+            "value",
+            "low",
+            "high",
+            "unit",
+            "flight",
+        )
         rows = [
-            (e.name, p.name, e.verdict, e.variance_share, e.p_value, p.value, p.low, p.high, p.unit)
+            (e.name, p.name, e.verdict, e.variance_share, e.p_value, p.value, p.low, p.high, p.unit, p.flight)
             for e in self.effects
             for p in e.parameters
         ]
@@ -336,13 +349,22 @@ class Diagnosis(results.Diagnosis):
             for verdict, names in (("missing", self.missing), ("possible", self.possible))
             if names
         )
+        of = f"{len(self.flights)} flights" if self.flights else self.flight.name
         return (
-            f"<Diagnosis of {self.flight.name}: {told or 'nothing missing'}; "
+            f"<Diagnosis of {of}: {told or 'nothing missing'}; "
             f"residual {self.rms_before:.3f} -> {self.rms_after:.3f} m/s², noise floor {self.noise_floor:.3f} m/s²>"
         )
 
     def _repr_html_(self) -> str:
         return self.summary().html
+
+
+def _own(p: results.ParameterEstimate) -> str:
+    return f"{p.name}@{p.flight}" if p.flight else p.name
+
+
+def _key(e: results.EffectVerdict, p: results.ParameterEstimate) -> str:
+    return f"{e.name}.{_own(p)}"
 
 
 @dataclass(frozen=True, repr=False)

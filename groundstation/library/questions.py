@@ -93,11 +93,13 @@ def where(
 
 
 def diagnose(
-    flight: Flight,
+    flight: Flight | Sequence[Flight],
     *,
     model: Which = None,
     validate: Flight | None = None,
     bandwidth: float | None = None,
+    per_flight: Sequence[str] = (),
+    shared: Sequence[str] = (),
     store: str | Path = DEFAULT_STORE,
     effects: str | Path | None = None,
 ) -> Diagnosis:
@@ -107,14 +109,22 @@ def diagnose(
     `model`, `bandwidth` (Hz), `store` and `effects` as for `compare`; exact rotation is always part of the model.
     Errors come back in m/s²; docs/diagnosis.md tells how verdicts are reached.
 
-    Raises `InputError` where a flight lacks what a comparison needs or is too short, and for a model of another
-    vehicle.
+    `flight` may be several flights of one vehicle, in the order of time: they are fitted together, with one value for
+    what is the vehicle's and one each for what is the flight's. `per_flight` and `shared` say otherwise of effects or
+    single parameters: `per_flight=["thrust_gain", "rotor_drag.x"]`. `flights`, `shared` and `differing` of the
+    diagnosis tell what they say together.
+
+    Raises `InputError` where a flight lacks what a comparison needs or is too short, for a model of another vehicle,
+    and for flights that do not belong together.
     """
-    from trueflight.groundstation.identify.translation import diagnose
+    from trueflight.groundstation.identify.flights import diagnose_flights
     from trueflight.groundstation.library.answers import Diagnosis
 
-    line = choose_line(flight, model, store, effects)
-    found = diagnose(flight, line[-1], validate, bandwidth)
+    flights = [flight] if isinstance(flight, Flight) else list(flight)
+    if not flights:
+        raise InputError("diagnose: no flight; pass one, or several of one vehicle")
+    line = choose_line(flights[0], model, store, effects)
+    found = diagnose_flights(flights, line[-1], validate, bandwidth, per_flight, shared)
     return answering(
         Diagnosis,
         found,
@@ -126,7 +136,7 @@ def diagnose(
 
 
 def report(
-    flight: Flight,
+    flight: Flight | Sequence[Flight],
     output: str | Path,
     *,
     model: Which = None,
@@ -136,7 +146,7 @@ def report(
     store: str | Path = DEFAULT_STORE,
     effects: str | Path | None = None,
 ) -> Diagnosis:
-    """Diagnose a `flight` and write it to `output` as one HTML page that opens offline and prints.
+    """Diagnose a `flight`, or several together, and write it to `output` as one HTML page that opens offline.
 
     `model`, `validate`, `bandwidth` (Hz), `store` and `effects` as for `diagnose`; `design` as for `track`, for the
     page's part on tracking. Returns the diagnosis. Raises `InputError` as `diagnose` does, and where the page cannot be
@@ -145,7 +155,7 @@ def report(
     found = diagnose(
         flight, model=model, validate=validate, bandwidth=bandwidth, store=store, effects=effects
     )
-    found.report(output, _design(flight, design))
+    found.report(output, _design(found.flight, design))
     return found
 
 

@@ -43,6 +43,7 @@ def _none(a: Analysis, table: Table) -> Charts:
 
 SECTIONS: tuple[Section, ...] = (
     Section("ranking", "Which effect is missing", _none),
+    Section("flights", "Numbers of the vehicle, and of each flight", _none, ("flights",)),
     Section(
         "waterfall", "The error as effects are added", lambda a, t: {"bars": charts.waterfall(t["waterfall"])}
     ),

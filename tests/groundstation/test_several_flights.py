@@ -13,6 +13,7 @@ import pytest
 from json_schemas import valid
 from simulated import fly_with
 
+import trueflight as tf
 from trueflight.groundstation.identify.differences import agreeing, common_value
 from trueflight.groundstation.identify.flights import diagnose_flights
 from trueflight.groundstation.identify.ownership import ownership
@@ -28,6 +29,7 @@ from trueflight.models.reference import trajectory
 from trueflight.sim_bridge.truth.hidden import Hidden
 
 DRAG = 0.25
+KEPT = TemporaryDirectory()
 WINDS = ((0.0, 0.0), (4.0, 1.0), (-2.0, 5.0))
 
 
@@ -41,15 +43,11 @@ def drag_in_wind(east: float, north: float) -> tuple[Hidden, ...]:
 def flown(seed: int, *hidden: str) -> Flight:
     """A survey flight in the wind of this seed; `hidden` is what else differs from the others."""
     more = {"weak": Hidden("rotor_damage", {"loss": 0.08, "rotor": 3.0})}
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / f"flight-{seed}.mcap"
-        fly_with(
-            path,
-            (*drag_in_wind(*WINDS[seed % 3]), *(more[name] for name in hidden)),
-            seed,
-            trajectory("excitation"),
-        )
-        return read_flight(path)
+    path = Path(KEPT.name) / "-".join(hidden) / f"flight-{seed}.mcap"
+    path.parent.mkdir(exist_ok=True)
+    wind = drag_in_wind(*WINDS[seed % 3])
+    fly_with(path, (*wind, *(more[name] for name in hidden)), seed, trajectory("excitation"))
+    return read_flight(path)
 
 
 def diagnosed(*flights: Flight, validation: Flight | None = None, **whose: list[str]) -> Diagnosis:
@@ -201,3 +199,17 @@ def test_the_command_takes_several_flights_and_says_what_differs(tmp_path: Path)
     done = programs.run("groundstation", "diagnose", files[0], files[0])
     assert done.returncode == 2
     assert "before.mcap: given twice; give it once" in done.stderr
+
+
+def test_the_report_and_the_library_show_all_flights(tmp_path: Path) -> None:
+    d = tf.report([flown(3), flown(1)], tmp_path / "both.html")
+    page = (tmp_path / "both.html").read_text()
+    assert "Numbers of the vehicle, and of each flight" in page
+    assert page.count("wind</span> x = ") == 2
+    for name in ("flight-3", "flight-1"):
+        assert name in page
+    assert d.params["wind.x@flight-1"] == pytest.approx(WINDS[1][0], abs=0.1)
+    assert set(d.interval("rotor_drag")) == {"x", "y"}
+    told = str(d.summary())
+    assert "2 flights of quad5" in told and "The same in all flights: rotor_drag x, rotor_drag y" in told
+    assert "no part of the vehicle's model: wind" in told.replace("\n", " ")
