@@ -103,7 +103,8 @@ class Parameter:
     have shown an effect of that size, and fits start there. `structural` marks a number that says where an effect
     acts and not how much (the height of a ceiling): it is fitted, but no value of it is "no effect". `even` marks one
     that acts by its square, so that its sign means nothing. `belongs_to` says whose number it is where several flights
-    are looked at together: the `VEHICLE`'s, the same in all of them, or each `FLIGHT`'s own.
+    are looked at together: the `VEHICLE`'s, the same in all of them, or each `FLIGHT`'s own. `grows` and `shrinks` say
+    in words that a vehicle's number is not what it was, with a place for the difference: "rotor 3 has lost {:.0%}".
 
     Raises `ValueError` for any other owner.
     """
@@ -121,6 +122,8 @@ class Parameter:
     actuation: str = ""
     truth: str = ""
     belongs_to: str = VEHICLE
+    grows: str = ""
+    shrinks: str = ""
 
     def __post_init__(self) -> None:
         if self.belongs_to not in (VEHICLE, FLIGHT):

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from trueflight.groundstation.commands.options import EffectsOption, JsonOption, MappingOption, VehicleOption
+from trueflight.groundstation.commands.options import (
+    EffectsOption,
+    JsonOption,
+    MappingOption,
+    PerFlightOption,
+    SharedOption,
+    VehicleOption,
+)
 from trueflight.groundstation.output.terminal import counted
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
@@ -43,18 +49,34 @@ def survey_command(
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler: tcp://HOST:8786. Default: this machine.")
     ] = None,
+    each_alone: Annotated[
+        bool, typer.Option("--each-alone", help="Do not fit the flights of a vehicle together.")
+    ] = False,
+    per_flight: PerFlightOption = None,
+    shared: SharedOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Diagnose every flight of a folder: how often each effect is missing, its spread over the fleet, its trend.
 
-    A file that cannot be used is told and skipped. `--save` writes survey.jsonl (one line a flight, as they are done),
+    The flights of each vehicle are then fitted together, and what has changed since the last good flight is told. A
+    file that cannot be used is told and skipped. `--save` writes survey.jsonl (one line a flight, as they are done),
     survey.parquet and fleet.json.
     """
-    from trueflight.groundstation.evaluate.survey import fleet_of, row_table, stamp_of, survey, survey_files
-    from trueflight.groundstation.output.as_json import plain
+    from trueflight.groundstation.evaluate.survey import (
+        fleet_of,
+        histories,
+        row_table,
+        stamp_of,
+        survey,
+        survey_files,
+    )
+    from trueflight.groundstation.identify.ownership import ownership
+    from trueflight.groundstation.output.as_json import fleet_table, plain
     from trueflight.groundstation.output.survey_tables import print_survey
     from trueflight.groundstation.study.kept_survey import keeping, kept_rows, write_survey
 
+    own = tuple(per_flight or ()), tuple(shared or ())
+    ownership(*own, None if effects is None else str(effects))
     files = survey_files(folder)
     known = [] if save is None else kept_rows(save, files, lambda text: console.print(text, style="yellow"))
     done = {(row.file, row.stamp) for row in known}
@@ -70,12 +92,16 @@ def survey_command(
             rows.append(row)
             keep(row)
             bar.advance(task)
-    rows.sort(key=lambda row: row.file)
-    fleet = fleet_of(rows)
+        rows.sort(key=lambda row: row.file)
+        tell("fitting the flights of each vehicle together")
+        together = (
+            [] if each_alone else histories(rows, vehicle, mapping, effects, jobs, memory, scheduler, own)
+        )
+    fleet = fleet_of(rows, together)
     if save is not None:
         write_survey(save, rows, fleet)
     if as_json:
-        print_json(plain({"flights": [row_table(r) for r in rows], "fleet": asdict(fleet)}))
+        print_json(plain({"flights": [row_table(r) for r in rows], "fleet": fleet_table(fleet)}))
     else:
         print_survey(console, rows, fleet, folder)
         if save is not None:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
+from trueflight.groundstation.evaluate.history import Flown, History, history_of
 from trueflight.groundstation.reading.flight_file import ENDINGS
 from trueflight.groundstation.reading.mapping import Given, absolute
 from trueflight.groundstation.reading.several import flight_files
@@ -111,6 +112,7 @@ class Fleet:
     unexplained: int
     effects: tuple[HowOften, ...]
     parameters: tuple[Spread, ...]
+    histories: tuple[History, ...] = ()
 
 
 def survey_files(folder: Path) -> list[Path]:
@@ -216,6 +218,37 @@ def survey(
     yield from _by_dask(names, task, jobs, memory, scheduler, ready)
 
 
+def histories(
+    rows: Sequence[Row],
+    vehicle: Path | None = None,
+    mapping: Given = None,
+    effects: Path | None = None,
+    jobs: int = 0,
+    memory: str = "auto",
+    scheduler: str | None = None,
+    own: tuple[Sequence[str], Sequence[str]] = ((), ()),
+) -> list[History]:
+    """The flights of each vehicle that has flown more than once, fitted together, and what has changed; `own` names
+    what is each flight's and what is shared against its effect's file. Where and how it is computed as in `survey`."""
+    flown: dict[str, list[Flown]] = {}
+    for row in rows:
+        if not row.error:
+            flown.setdefault(row.vehicle, []).append(Flown(row.file, row.day, not row.unexplained))
+    several = {name: flights for name, flights in sorted(flown.items()) if len(flights) > 1}
+    believed, folder = (None if p is None else str(p.resolve()) for p in (vehicle, effects))
+    task = (believed, absolute(mapping), folder, *own)
+    if scheduler is None and (jobs == 1 or len(several) < 2):
+        return [history_of(name, flights, *task) for name, flights in several.items()]
+    with _workers(min(jobs, len(several)), memory, scheduler) as client:
+        futures = [client.submit(history_of, n, flights, *task, pure=False) for n, flights in several.items()]
+        return [
+            f.result()
+            if f.exception() is None
+            else History(n, error=f"{type(f.exception()).__name__}: its worker did not survive it")
+            for n, f in zip(several, futures, strict=True)
+        ]
+
+
 def _by_dask(
     names: list[str],
     task: _Task,
@@ -298,8 +331,8 @@ def _surveyed(client: Client, names: list[str], task: _Task) -> Iterator[Row]:
 # --- the fleet ------------------------------------------------------------------------------------------------
 
 
-def fleet_of(rows: Sequence[Row]) -> Fleet:
-    """What holds of all flights together."""
+def fleet_of(rows: Sequence[Row], told: Sequence[History] = ()) -> Fleet:
+    """What holds of all flights together; `told` are the histories of the vehicles."""
     good = [r for r in rows if not r.error]
     names = list(dict.fromkeys(name for r in good for name in r.verdicts))
     often = [_how_often(name, good) for name in names]
@@ -313,6 +346,7 @@ def fleet_of(rows: Sequence[Row]) -> Fleet:
         unexplained=sum(bool(r.unexplained) for r in good),
         effects=tuple(often),
         parameters=tuple(_spread(effect, parameter, good) for effect, parameter in keys),
+        histories=tuple(told),
     )
 
 

@@ -14,6 +14,7 @@ from trueflight.groundstation.results import (
     Diagnosis,
     EffectVerdict,
     ParameterEstimate,
+    SharedNumber,
     WaterfallStep,
     WhereItFails,
 )
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from trueflight.groundstation.evaluate.bound import Tube
     from trueflight.groundstation.evaluate.calibration import Calibration, Case
     from trueflight.groundstation.evaluate.side_by_side import SideBySide
+    from trueflight.groundstation.evaluate.survey import Fleet
     from trueflight.groundstation.evaluate.tracking import Tracking
     from trueflight.groundstation.identify.planning import FlightPlan
     from trueflight.groundstation.learn.training import Training
@@ -138,20 +140,41 @@ def _several_tables(d: Diagnosis) -> dict[str, Any]:
         }
         for f in d.flights
     ]
-    shared = [
+    return {
+        "flights": flights,
+        "shared": [shared_table(n) for n in d.shared],
+        "set_aside": list(d.set_aside),
+    }
+
+
+def shared_table(n: SharedNumber) -> dict[str, Any]:
+    """The JSON of a number of the vehicle over several flights."""
+    return {
+        "effect": n.effect,
+        "parameter": n.parameter,
+        "likelihood_ratio": n.ratio,
+        "p_value": n.p_value,
+        "differs": n.differs,
+        "apart": list(n.apart),
+        "common": None if n.common is None else interval_table(n.common),
+        "values": {v.flight: interval_table(v) for v in n.values},
+    }
+
+
+def fleet_table(fleet: Fleet) -> dict[str, Any]:
+    """The JSON of what holds of all flights of a survey."""
+    vehicles = [
         {
-            "effect": n.effect,
-            "parameter": n.parameter,
-            "likelihood_ratio": n.ratio,
-            "p_value": n.p_value,
-            "differs": n.differs,
-            "apart": list(n.apart),
-            "common": None if n.common is None else interval_table(n.common),
-            "values": {v.flight: interval_table(v) for v in n.values},
+            **{k: getattr(h, k) for k in ("vehicle", "flights", "left_out", "missing", "error")},
+            "numbers": [shared_table(n) for n in h.numbers],
+            "changes": [
+                {**asdict(c), "before": interval_table(c.before), "after": interval_table(c.after)}
+                for c in h.changes
+            ],
         }
-        for n in d.shared
+        for h in fleet.histories
     ]
-    return {"flights": flights, "shared": shared, "set_aside": list(d.set_aside)}
+    return {**asdict(fleet), "histories": vehicles}
 
 
 def consistency_table(flight: Flight) -> list[dict[str, Any]]:

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from trueflight.groundstation.evaluate.history import History
 from trueflight.groundstation.evaluate.survey import Fleet, Row
 from trueflight.groundstation.output.tables import percent
 
@@ -26,8 +27,27 @@ def print_survey(console: Console, rows: Sequence[Row], fleet: Fleet, folder: Pa
         f"{fleet.clean} lack nothing, {fleet.unexplained} hold something that no effect explains",
         highlight=False,
     )
+    for h in fleet.histories:
+        _print_history(console, h)
     _print_effects(console, fleet)
     _print_parameters(console, fleet)
+
+
+def _print_history(console: Console, h: History) -> None:
+    """What has changed of one vehicle."""
+    name = f"[bold]{escape(h.vehicle)}[/bold]"
+    if h.error:
+        console.print(f"{name}: its flights could not be fitted together: {escape(h.error)}", highlight=False)
+        return
+    for change in h.changes:
+        console.print(f"{name}: {escape(change.text)}", style="yellow", highlight=False)
+    if not h.changes and len(h.flights) > 1:
+        console.print(
+            f"{name}: {len(h.flights)} flights fitted together, the newest is as those before",
+            highlight=False,
+        )
+    for reason in h.left_out:
+        console.print(f"[dim]{escape(h.vehicle)}: left out: {escape(reason)}[/dim]", highlight=False)
 
 
 def _print_flights(console: Console, rows: Sequence[Row], folder: Path) -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 
 from trueflight.groundstation.evaluate.survey import (
@@ -18,7 +17,7 @@ from trueflight.groundstation.evaluate.survey import (
     stamp_of,
     write_table,
 )
-from trueflight.groundstation.output.as_json import plain
+from trueflight.groundstation.output.as_json import fleet_table, plain
 from trueflight.models.errors import InputError
 from trueflight.models.whole_file import write_whole
 
@@ -64,5 +63,5 @@ def keeping(save: Path | None, new: bool) -> Iterator[Callable[[Row], None]]:
 def write_survey(save: Path, rows: Iterable[Row], fleet: Fleet) -> None:
     """The rows as a table, and what holds of the fleet."""
     write_table(list(rows), save / SAVED_TABLE)
-    text = json.dumps(plain(asdict(fleet)), indent=1, allow_nan=False)
+    text = json.dumps(plain(fleet_table(fleet)), indent=1, allow_nan=False)
     write_whole(save / "fleet.json", text + "\n", "the survey", "pass another --save")

@@ -40,7 +40,17 @@ EFFECT = Effect(
     stage=Stage.THRUST,
     formula=formula,
     parameters=tuple(
-        Parameter(f"loss_{i}", "1", f"share of the thrust that rotor {i} lacks", 0.0, 0.1, 0.0, 0.7)
+        Parameter(
+            f"loss_{i}",
+            "1",
+            f"share of the thrust that rotor {i} lacks",
+            0.0,
+            0.1,
+            0.0,
+            0.7,
+            grows=f"rotor {i} has lost {{:.0%}} of its thrust",
+            shrinks=f"rotor {i} has regained {{:.0%}} of its thrust",
+        )
         for i in (1, 2, 3, 4)
     ),
     needs=("angular_velocity", "thrust_command"),

@@ -25,7 +25,7 @@ from trueflight.models.reference import trajectory
 from trueflight.models.vehicle import load_vehicle
 from trueflight.sim_bridge.in_process import record
 from trueflight.sim_bridge.plan import Plan
-from trueflight.sim_bridge.truth.hidden import choose
+from trueflight.sim_bridge.truth.hidden import Hidden, choose
 from trueflight.sim_bridge.truth.sensors import Noise
 
 DRAG = {"one": 0.20, "two": 0.30}
@@ -152,3 +152,25 @@ def test_a_trend_is_seen_beside_what_parts_the_vehicles() -> None:
     (spread,) = fleet_of(rows_of(values, 0.01)).parameters
     assert spread.trend_per_day == pytest.approx(-0.01, rel=0.05)
     assert spread.trend_p < 1e-6
+
+
+def test_what_changed_since_the_last_good_flight_is_told_with_its_day(tmp_path, capsys, monkeypatch) -> None:
+    vehicle = load_vehicle(VEHICLE)
+    design = load_design(VEHICLE.with_name("design.json"), vehicle)
+    flown = trajectory("lemniscate", speed=2.5, laps=2)
+    weak = Hidden("rotor_damage", {"loss": 0.06, "rotor": 3.0})
+    for seed, (day, hidden) in enumerate((("03-10", ()), ("03-12", ()), ("04-02", (weak,)))):
+        record(Plan(vehicle, design, flown, hidden, seed, noise=Noise()), tmp_path / f"log-2026-{day}.mcap")
+    code, out, _ = run(capsys, monkeypatch, "survey", tmp_path, "--jobs", 1, "--json")
+    assert code == 0
+    (history,) = valid("groundstation survey", json.loads(out))["fleet"]["histories"]
+    assert [os.path.basename(f) for f in history["flights"]] == [
+        f"log-2026-{day}.mcap" for day in ("03-10", "03-12", "04-02")
+    ]
+    (change,) = history["changes"]
+    told = "compared with 12 March 2026 (log-2026-03-12.mcap), rotor 3 has lost 6 % of its thrust"
+    assert change["text"] == told
+    assert (os.path.basename(change["since"]), change["parameter"]) == ("log-2026-04-02.mcap", "loss_3")
+    assert change["after"]["value"] == pytest.approx(0.06, abs=0.005)
+    code, out, _ = run(capsys, monkeypatch, "survey", tmp_path, "--jobs", 1, "--each-alone")
+    assert code == 0 and "compared with" not in out
