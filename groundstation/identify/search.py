@@ -28,7 +28,7 @@ from trueflight.groundstation.identify.fitting import (
     block_errors,
     variance_per_independent_sample,
 )
-from trueflight.groundstation.identify.spans import Span
+from trueflight.groundstation.identify.spans import EVERYWHERE, Span
 from trueflight.models.effect import Effect, Parameter
 
 FAMILY = 0.01
@@ -46,6 +46,8 @@ LINEARISED = 2.0
 MOST_EFFECTS = 6
 ACTS = 1e-3
 """Part of the held-out error from which an effect is said to act there."""
+NOTHING = 0.1
+"""Typical sizes below which a number is next to nothing."""
 SETS = 3
 """Sets of each size that are fitted in full where more than noise is left."""
 
@@ -152,10 +154,15 @@ def evidence(problem: Measured, for_: Fit, against: Fit) -> float:
 
 
 def plausible(fitted: Fit, name: str) -> bool:
-    """Whether the interval of each parameter of the effect reaches into its physical range."""
+    """Whether the interval of each parameter of the effect reaches into its physical range. A number that holds on a
+    span only, and is next to nothing there, is no worse for its sign."""
     for i in fitted.of(name):
         _, high = fitted.interval(i)
         p, x = fitted.free[i].parameter, fitted.estimate[i]
+        if fitted.free[i].span != EVERYWHERE and not p.structural:
+            neutral = fitted.free[i].neutral
+            if abs(x - neutral) < NOTHING * abs(p.typical - neutral):
+                continue
         if high < p.low or x > p.high + 1e-9 or (p.low != 0.0 and x < p.low - 1e-9):
             return False
     return True

@@ -247,8 +247,8 @@ class _Joint:
         shared: list[SharedNumber] = []
         while True:
             search = Search(problem)
-            found = search.settle(choices)
-            answers = asked(problem, found.fit, found.names, self.names, 0.0, len(problem.choices))
+            here = search.state(choices)
+            answers = asked(problem, here.fit, here.names, self.names, 0.0, len(problem.choices))
             answers = tuple(_within_a_set(a, effects[a.effect]) for a in answers)
             differing = [a for a in answers if a.differs]
             if not differing:
@@ -256,7 +256,7 @@ class _Joint:
             worst = max(differing, key=lambda a: a.ratio)
             shared.append(worst)
             problem = replace(problem, whose=problem.whose.with_own([(worst.effect, worst.parameter)]))
-        before = search.state(())
+        before, found = search.state(()), search.settle(choices)
         scale = Scale(before.fit.sse, lambda share: "", "rotation")
         doubt = Weighing(problem, found.fit, problem.noise, quiet=problem.only_noise(found.fit))
         named, absent = judge(search, found, found.fit, scale, doubt=doubt)
