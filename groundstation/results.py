@@ -243,12 +243,77 @@ class EffectVerdict:
 
 @dataclass(frozen=True)
 class RotationalRms:
-    """Residual of the angular acceleration that the rotors' torques explain, RMS over all axes in rad/s²."""
+    """Residual of the angular acceleration that the rotors' torques explain, RMS over all measured axes in rad/s², up
+    to `bandwidth` Hz; `source` is what told it: the "gyroscope", or the "attitude" twice differentiated."""
 
     before: float
     after: float
     noise_floor: float
     bandwidth: float
+    source: str = "gyroscope"
+
+
+@dataclass(frozen=True)
+class MotorShares:
+    """What each of R rotors carries of the thrust, on the mean of a flight.
+
+    `shares` (R) sum to 1, with half-widths of 95 % intervals in `errors`; `uneven` is the difference of the largest and
+    the least over the mean. `rotor` is the number (from 1) of the one that stands out, 0 where none does: by `excess`,
+    with its 95 % interval, more than the mean of the others, beyond what it carries in a healthy vehicle: in the
+    flights `compared_with`, or where there are none in an even one. `changes` (R) since those flights are relative to
+    the median rotor; `collective` is by what factor the vehicle is driven harder than in them, NaN without them or
+    without motor commands. `losses` is the part of its thrust that this rotor would lack, with its interval; `centre`
+    (2) the change of the centre of thrust, m, body x and y, with half-widths in `centre_errors`; `yaw` that of the
+    balance about z, a part of all thrust.
+    """
+
+    shares: tuple[float, ...]
+    errors: tuple[float, ...]
+    compared_with: tuple[str, ...]
+    changes: tuple[float, ...]
+    collective: float
+    uneven: float
+    rotor: int
+    excess: float
+    excess_low: float
+    excess_high: float
+    losses: tuple[float, ...]
+    centre: tuple[float, ...]
+    centre_errors: tuple[float, ...]
+    yaw: float
+
+    @property
+    def told(self) -> str:
+        """What the shares say, in a sentence; empty where no rotor stands out."""
+        if not self.rotor:
+            return ""
+        text = (
+            f"rotor {self.rotor} carries {self.shares[self.rotor - 1]:.1%} of the commanded thrust".replace(
+                "%", " %"
+            )
+        )
+        more = f"{100 * self.excess:.0f} % [{100 * self.excess_low:.0f}, {100 * self.excess_high:.0f}]"
+        if self.compared_with:
+            text += f", {more} more beside the others than in {' and '.join(self.compared_with)}"
+            if np.isfinite(self.collective):
+                text += f", the whole vehicle is driven {100 * (self.collective - 1):+.0f} %"
+            return text
+        return f"{text}, {more} more than the others"
+
+    @property
+    def advice(self) -> str:
+        """What would tell more."""
+        if not self.rotor:
+            return ""
+        if self.compared_with:
+            return (
+                "a weaker rotor and a weight near it both raise its share: look at the propeller and weigh the "
+                "vehicle; or record the gyroscope, and fly rolls, pitches and yaws both ways"
+            )
+        return (
+            "a weaker rotor, a weight near it and the way the vehicle was built all do this: compare with a flight "
+            "when it was healthy (--healthy FLIGHT), and weigh it"
+        )
 
 
 @dataclass(frozen=True)
@@ -301,7 +366,8 @@ class Diagnosis:
     RMS on the held-out flight, None without one. `clock_shift` is by how much later than its vehicle file says the
     command acts, s, None where no clock was fitted. `unexplained` tells whether predictable structure is left;
     `left_out` the share of the samples that did not count, by reason. `rotational` is the residual of the angular
-    acceleration, None where it was not seen; `alternatives` are other sets of effects that explain the flight nearly as
+    acceleration, None where it was not seen; `shares` is what each rotor carries, None where it was not logged;
+    `alternatives` are other sets of effects that explain the flight nearly as
     well as those found.
 
     Of several flights fitted together, `flights` tells what each adds (empty for one), and `flight` is the last of
@@ -326,6 +392,7 @@ class Diagnosis:
     left_out: dict[str, float]
     rotational: RotationalRms | None = None
     alternatives: tuple[tuple[str, ...], ...] = ()
+    shares: MotorShares | None = None
     flights: tuple[OneFlight, ...] = ()
     shared: tuple[SharedNumber, ...] = ()
     set_aside: tuple[str, ...] = ()

@@ -105,6 +105,7 @@ class Parameter:
     that acts by its square, so that its sign means nothing. `belongs_to` says whose number it is where several flights
     are looked at together: the `VEHICLE`'s, the same in all of them, or each `FLIGHT`'s own. `grows` and `shrinks` say
     in words that a vehicle's number is not what it was, with a place for the difference: "rotor 3 has lost {:.0%}".
+    `rotor` is the number of the rotor that it belongs to, from 1: a vehicle with fewer does not have it.
 
     Raises `ValueError` for any other owner.
     """
@@ -121,6 +122,7 @@ class Parameter:
     clock_samples: float = 0.0
     actuation: str = ""
     truth: str = ""
+    rotor: int = 0
     belongs_to: str = VEHICLE
     grows: str = ""
     shrinks: str = ""
@@ -199,7 +201,8 @@ class Effect:
 
     def apply(self, motion: Motion, values: Mapping[str, Any]) -> Motion:
         """The motion with this effect acting; `values` by parameter name."""
-        return self.formula(motion, **{p.name: values[p.name] for p in self.parameters})
+        given = [p.name for p in self.parameters if p.name in values or not p.rotor]
+        return self.formula(motion, **{name: values[name] for name in given})
 
     def lacks(self, flight: Flight) -> tuple[str, ...]:
         """The columns it needs and the flight does not have."""
@@ -212,7 +215,12 @@ class Effect:
 
     def neutral(self, vehicle: Vehicle) -> dict[str, float]:
         """Parameter values at which the effect does nothing."""
-        return {p.name: p.neutral_for(vehicle) for p in self.parameters}
+        return {p.name: p.neutral_for(vehicle) for p in self.parameters_of(vehicle)}
+
+    def parameters_of(self, vehicle: Vehicle) -> tuple[Parameter, ...]:
+        """Its parameters without those of rotors that the vehicle does not have (one that tells none has four)."""
+        rotors = len(vehicle.rotor_positions) or 4
+        return tuple(p for p in self.parameters if p.rotor <= rotors)
 
     def typical(self, motion: Motion) -> dict[str, float]:
         """Parameter values of a size that matters, on this flight."""

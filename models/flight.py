@@ -104,6 +104,8 @@ class Flight:
     recorded commands). `accelerometer` is False where `specific_force` was differentiated from the trajectory or is an
     estimator's; `bandwidth` is then its bandwidth in Hz, otherwise None. `sensor_rate` is the rate in Hz at which the
     accelerometer (or velocity) has new values, where the log repeats them; otherwise None.
+    `unlogged` names the angles of the attitude ("pitch") that were not logged but made of other columns: what is
+    differentiated from them tells nothing.
     `origin` is the file, `data_hash` its SHA-256.
     `notes` tells what the reader had to do (resampling, gaps, cut takeoff), `consistency` which of its columns agree.
     """
@@ -129,6 +131,7 @@ class Flight:
     accelerometer: bool = True
     bandwidth: float | None = None
     sensor_rate: float | None = None
+    unlogged: tuple[str, ...] = ()
     origin: str = ""
     data_hash: str = ""
     notes: tuple[str, ...] = ()

@@ -201,7 +201,8 @@ def _check_terms(path: Path, terms: tuple[Term, ...], directory: str | None) -> 
         if term.effect not in known:
             raise InputError(f"{path}: unknown effect {shown(term.effect)}; pass --effects DIR with its file")
         wanted = {p.name for p in known[term.effect].parameters}
-        if missing := wanted - set(term.values):
+        always = {p.name for p in known[term.effect].parameters if not p.rotor}
+        if missing := always - set(term.values):
             raise InputError(
                 f"{path}: effect '{term.effect}' lacks the parameter {', '.join(sorted(missing))}"
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -55,6 +56,13 @@ def diagnose_command(
     ] = "command",
     per_flight: PerFlightOption = None,
     shared: SharedOption = None,
+    healthy: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--healthy",
+            help="A flight of the same vehicle when all was well: what each rotor carries is compared.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Which effect is missing: ranked, with parameters and intervals, checked on held-out data.
@@ -79,10 +87,11 @@ def diagnose_command(
     if thrust == "rotors":
         flights = [thrust_from_rotors(one) for one in flights]
         held_out = None if held_out is None else thrust_from_rotors(held_out)
+    well = [read_held_out(path, flights[0], vehicle, mapping) for path in healthy or ()]
     line = choose_line(flights[0], model, store, effects)
     with working(console, "looking for missing effects", as_json) as progress:
         found = diagnose_flights(
-            flights, line[-1], held_out, bandwidth, per_flight or (), shared or (), progress
+            flights, line[-1], held_out, bandwidth, per_flight or (), shared or (), progress, well
         )
         if save is None and not as_json:
             print_diagnosis(console, found, everything)

@@ -108,13 +108,15 @@ def analyse(
     design: Design | None = None,
     side_by_side: SideBySide | None = None,
     progress: Callable[[str], None] = lambda _: None,
+    healthy: Sequence[Flight] = (),
 ) -> Analysis:
     """Diagnose `flight` from the last model of `line` (the models that led to it before), and gather all there is to
-    see: every version on the flight and on `validation`, where they fail, and how the flight was tracked.
+    see: every version on the flight and on `validation`, where they fail, and how the flight was tracked. What each
+    rotor carries is compared with the flights in `healthy`.
 
     Raises `InputError` where the flight lacks what a comparison needs.
     """
-    diagnosis = diagnose(flight, line[-1], validation, bandwidth, progress)
+    diagnosis = diagnose(flight, line[-1], validation, bandwidth, progress, healthy)
     return gather(diagnosis, line, validation, bandwidth, design, side_by_side, progress)
 
 

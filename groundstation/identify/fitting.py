@@ -116,7 +116,7 @@ class MeasuredFlights:
     def predictor(self, effects: Sequence[Effect], keep: int = 0) -> Callable[[Sequence[Values]], np.ndarray]:
         """`predict` as a function of the values of `effects`, for many calls: it keeps the last `keep` pieces, so that
         a number is only predicted anew where it holds."""
-        names = [tuple(p.name for p in effect.parameters) for effect in effects]
+        names = [tuple(p.name for p in effect.parameters_of(self.vehicle)) for effect in effects]
 
         def force(flight: int, key: tuple[tuple[float, ...], ...]) -> np.ndarray:
             values = (dict(zip(n, k, strict=True)) for n, k in zip(names, key, strict=True))

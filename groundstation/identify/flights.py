@@ -21,18 +21,22 @@ def diagnose_flights(
     per_flight: Sequence[str] = (),
     shared: Sequence[str] = (),
     progress: Callable[[str], None] = lambda _: None,
+    healthy: Sequence[Flight] = (),
 ) -> Diagnosis:
     """Find the effects that `base` lacks: on one flight, or on several of one vehicle in one fit.
 
     `per_flight` and `shared` name effects or single parameters ("rotor_drag.x") that are each flight's own, or one for
-    all, whatever their files say. Raises `InputError` as `diagnose` and `diagnose_together`.
+    all, whatever their files say; with `healthy` flights, what each rotor carries in one is compared. Raises
+    `InputError` as `diagnose` and `diagnose_together`.
     """
     whose = ownership(per_flight, shared, base.effects_directory)
     if len(flights) > 1:
+        if healthy:
+            raise InputError("--healthy goes with one flight; give one, and the others with --healthy")
         if validation is not None:
             check_together([*flights, validation])
         return diagnose_together(flights, base, validation, bandwidth, whose, progress)
     if per_flight or shared:
         option = "--per-flight" if per_flight else "--shared"
         raise InputError(f"{option} goes with several flights of one vehicle; give more than one")
-    return diagnose(flights[0], base, validation, bandwidth, progress)
+    return diagnose(flights[0], base, validation, bandwidth, progress, healthy)

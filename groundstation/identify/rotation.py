@@ -14,10 +14,13 @@ import numpy as np
 from trueflight.groundstation.identify.actuation import fit_rate_loop
 from trueflight.groundstation.identify.adequacy import ABOVE
 from trueflight.groundstation.identify.doubt import Weighing
+from trueflight.groundstation.identify.rotors_apart import doubted
 from trueflight.groundstation.identify.search import Search
+from trueflight.groundstation.identify.shares import judge_shares, motor_shares
 from trueflight.groundstation.identify.torque import TorqueProblem, turning_of
 from trueflight.groundstation.identify.verdicts import Scale, by_weight, judge, unmeasured
-from trueflight.groundstation.results import EffectVerdict, RotationalRms
+from trueflight.groundstation.measured.measurement import measure_rotation
+from trueflight.groundstation.results import EffectVerdict, MotorShares, RotationalRms
 from trueflight.models.effect import Effect, Stage
 from trueflight.models.effects import catalogue
 from trueflight.models.flight import Flight
@@ -26,37 +29,55 @@ from trueflight.models.model import Term
 
 @dataclass(frozen=True)
 class RotationalFindings:
-    """What the rotation of a flight says: verdicts, the terms found, and the residual where rotors were recorded."""
+    """What the rotation of a flight says: verdicts, the terms found, and the residual and what each rotor carries where
+    rotors were recorded."""
 
     verdicts: tuple[EffectVerdict, ...]
     terms: tuple[Term, ...]
     rms: RotationalRms | None
+    shares: MotorShares | None = None
 
 
 def judge_rotation(
-    flight: Flight, included: Sequence[str] = (), effects_directory: str | None = None
+    flight: Flight,
+    included: Sequence[str] = (),
+    effects_directory: str | None = None,
+    healthy: Sequence[Flight] = (),
 ) -> RotationalFindings:
-    """Verdicts on all effects on the torque; `included` are in the model already."""
+    """Verdicts on all effects on the torque; `included` are in the model already, `healthy` flights of the same vehicle
+    to compare what each rotor carries with."""
+    shares = motor_shares(flight, healthy)
     effects = {
         n: e for n, e in catalogue(effects_directory).items() if e.rotational and e.stage is not Stage.RATE
     }
-    missing = {n: e.lacks(flight) for n, e in effects.items() if n not in included}
+    turns = _that_turns(flight)
+    missing = {n: e.lacks(turns) for n, e in effects.items() if n not in included}
     measurable = tuple(n for n, columns in missing.items() if not columns)
     turning = turning_of(flight) if measurable else None
     if turning is None:
-        return RotationalFindings(tuple(unmeasured(effects[n], c) for n, c in missing.items()), (), None)
+        unseen = judge_shares(shares, [unmeasured(effects[n], c) for n, c in missing.items()])
+        return RotationalFindings(unseen, (), None, shares)
     problem = TorqueProblem(turning, effects, measurable, tuple(n for n in effects if n in included))
     search = Search(problem)
     before, found = search.state(()), search.select()
     scale = Scale(before.fit.sse, lambda share: "", "rotation")
     r = problem.turning.rotation
-    left = found.fit.residual / problem.weight
-    noise_alone = bool(np.all(np.sqrt(np.mean(left**2, axis=0)) < ABOVE * r.noise))
-    doubt = Weighing(problem, found.fit, r.noise * problem.weight, quiet=noise_alone)
+    left, noise = found.fit.residual / problem.weight, r.noise[list(r.axes)]
+    noise_alone = bool(np.all(np.sqrt(np.mean(left**2, axis=0)) < ABOVE * noise))
+    doubt = Weighing(problem, found.fit, noise * problem.weight, quiet=noise_alone)
     named, absent = judge(search, found, found.fit, scale, doubt=doubt)
+    named, absent = ([doubted(v, problem, found.fit, noise_alone) for v in x] for x in (named, absent))
     others = [unmeasured(effects[n], c) for n, c in missing.items() if n not in measurable]
     rms = problem.rms(before.fit, found.fit)
-    return RotationalFindings((*named, *by_weight(absent), *others), found.fit.terms, rms)
+    verdicts = judge_shares(shares, [*named, *by_weight(absent), *others])
+    kept = {v.name for v in verdicts if v.rank is not None}
+    return RotationalFindings(verdicts, tuple(t for t in found.fit.terms if t.effect in kept), rms, shares)
+
+
+def _that_turns(flight: Flight) -> Flight:
+    """The flight with the body rates of its attitude where it has no others."""
+    rotation = measure_rotation(flight) if flight.angular_velocity is None else None
+    return flight if rotation is None else rotation.flight
 
 
 def fit_rotation(flight: Flight, effect: Effect) -> Term | None:

@@ -31,41 +31,51 @@ from trueflight.models.lag import delayed, lagged
 from trueflight.models.model import Term
 from trueflight.models.prediction import apply_effects, derivative, motion_of_flight
 
+FEWEST = 3
+"""Rotors of a vehicle whose torques are told apart: with fewer, something else than their thrust turns it."""
 MATERIAL_SIZE = 0.1
 """Smallest parameter that is called missing, in typical sizes: rotors of one set differ by a percent."""
 
 
 @dataclass(frozen=True)
 class Turning:
-    """The measured angular acceleration and the columns that explain it, filtered and thinned alike.
+    """The measured angular acceleration and the columns that explain it, filtered and thinned alike, on the A axes
+    that are measured.
 
-    `motion` is the flight with each rotor's thrust as late as it acts.
+    `motion` is the flight with each rotor's thrust as late as it acts, `actuation` the delay and lag of it in s that
+    were fitted, None where rotor speeds were recorded.
     """
 
     rotation: Rotation
     motion: Motion
     inertia: np.ndarray
+    actuation: tuple[float, float] | None = None
+
+    def seen(self, column: np.ndarray) -> np.ndarray:
+        """A column (N, 3) of angular acceleration as it is measured, (K, A)."""
+        r = self.rotation
+        return r.smooth(column)[r.used][:, r.axes]
 
     def columns(self, torque: np.ndarray) -> np.ndarray:
-        """Angular acceleration (K, 3) of a torque (N, 3) on the believed inertia, at the used samples."""
-        return self.rotation.smooth(torque / self.inertia)[self.rotation.used]
+        """Angular acceleration (K, A) of a torque (N, 3) on the believed inertia, at the used samples."""
+        return self.seen(torque / self.inertia)
 
     @cached_property
     def measured(self) -> np.ndarray:
-        """Angular acceleration (K, 3), rad/s², without what Euler's equations give to the believed inertia."""
+        """Angular acceleration (K, A), rad/s², without what Euler's equations give to the believed inertia."""
         rate = self.motion.body_rate
         euler = np.cross(rate, rate * self.inertia) / self.inertia
         r = self.rotation
-        return r.value[r.used] + r.smooth(euler)[r.used]
+        return r.value[r.used][:, r.axes] + self.seen(euler)
 
     @cached_property
     def control(self) -> np.ndarray:
-        """Angular acceleration (K, 3) of the rotors' thrusts without any effect."""
+        """Angular acceleration (K, A) of the rotors' thrusts without any effect."""
         return self.columns(np.asarray(apply_effects(self.motion, ()).torque))
 
     @cached_property
     def nuisances(self) -> list[tuple[str, np.ndarray]]:
-        """Name and column (K, 3) of what is fitted beside every effect: first a gain of the control torque about each
+        """Name and column (K, A) of what is fitted beside every effect: first a gain of the control torque about each
         axis, which effects go through as well."""
         motion, r = self.motion, self.rotation
         torque = np.asarray(apply_effects(motion, ()).torque) / self.inertia
@@ -77,15 +87,18 @@ class Turning:
         speeds = np.sqrt(np.clip(motion.rotor_thrust, 0.0, None))
         spin = derivative(speeds @ np.array(motion.vehicle.rotor_directions, float)[:, None], r.flight.t)
         found.append(("spin_up", spin * np.eye(3)[2]))
+        # motors that lean by a degree, or drag that differs between the two directions, turn a healthy vehicle
+        found.append(("trim_z", np.sum(motion.rotor_thrust, axis=1)[:, None] * np.eye(3)[2]))
         if motion.air_velocity is not None and r.flight.velocity is not None:
             body = rotate_inverse(r.flight.quaternion, r.flight.velocity)  # type: ignore[arg-type]
             found += [
                 ("flapping_x", body[:, 1:2] * np.eye(3)[0]),
                 ("flapping_y", body[:, 0:1] * np.eye(3)[1]),
             ]
-        kept = [(f"gain_{n}", self.control * np.eye(3)[i]) for i, n in enumerate("xyz")]
+        along = np.eye(len(r.axes))
+        kept = [(f"gain_{'xyz'[axis]}", self.control * along[i]) for i, axis in enumerate(r.axes)]
         for name, column in found:
-            seen = r.smooth(column)[r.used]
+            seen = self.seen(column)
             size = float(np.sqrt(np.mean(seen**2)))
             if size > 1e-9:
                 kept.append((name, seen / size))
@@ -101,22 +114,29 @@ class Turning:
 def turning_of(flight: Flight) -> Turning | None:
     """The rotation of a flight with rotor speeds or motor commands; None where it cannot be compared."""
     rotation = measure_rotation(flight)
+    if rotation is None:
+        return None
+    flight = rotation.flight
     motion = motion_of_flight(flight)
-    if rotation is None or motion.rotor_thrust is None or len(flight.vehicle.rotor_positions) != 4:
+    if motion.rotor_thrust is None or len(flight.vehicle.rotor_positions) < FEWEST:
         return None
     inertia = np.array(flight.vehicle.inertia, dtype=float)
     if np.any(inertia <= 0.0):  # not told: every axis has a gain of its own anyway
         arm = float(np.mean(np.abs(np.array(flight.vehicle.rotor_positions)[:, :2])))
         inertia = np.array([0.4, 0.4, 0.8]) * flight.vehicle.mass * max(arm, 1e-3) ** 2
-    motion = motion.with_(torque=np.zeros_like(rotation.flight.angular_velocity))
+    motion = motion.with_(torque=np.zeros_like(flight.angular_velocity))
+    actuation = None
     if flight.rotor_speed is None:
-        motion = _as_late_as_it_acts(motion, rotation, inertia)
-    turning = Turning(rotation, motion, inertia)
-    return turning if float(np.std(turning.control[:, :2])) > 1e-6 else None
+        motion, actuation = _as_late_as_it_acts(motion, rotation, inertia)
+    turning = Turning(rotation, motion, inertia, actuation)
+    tilts = [i for i, axis in enumerate(rotation.axes) if axis < 2]
+    return turning if float(np.std(turning.control[:, tilts])) > 1e-6 else None
 
 
-def _as_late_as_it_acts(motion: Motion, rotation: Rotation, inertia: np.ndarray) -> Motion:
-    """Motor commands through the delay and lag with which their torque is best seen in the angular acceleration."""
+def _as_late_as_it_acts(
+    motion: Motion, rotation: Rotation, inertia: np.ndarray
+) -> tuple[Motion, tuple[float, float]]:
+    """Motor commands through the delay and lag, s, with which their torque is best seen in the angular acceleration."""
     from scipy import optimize  # dear to load
 
     speeds = np.sqrt(np.clip(motion.rotor_thrust, 0.0, None))
@@ -126,11 +146,12 @@ def _as_late_as_it_acts(motion: Motion, rotation: Rotation, inertia: np.ndarray)
         late = [lagged(delayed(column, delay, dt), tau, dt) ** 2 for column in speeds.T]
         return motion.with_(rotor_thrust=np.stack(late, axis=1))
 
-    measured = rotation.value[rotation.used][:, :2]
+    tilts = [axis for axis in rotation.axes if axis < 2]
+    measured = rotation.value[rotation.used][:, tilts]
 
     def misfit(x: np.ndarray) -> float:
         torque = np.asarray(apply_effects(acting(*x), ()).torque) / inertia
-        seen = rotation.smooth(torque[:, :2])[rotation.used]
+        seen = rotation.smooth(torque[:, tilts])[rotation.used]
         seen = seen - seen.mean(axis=0)
         gain = np.sum(seen * measured, axis=0) / np.maximum(np.sum(seen**2, axis=0), 1e-12)
         return float(np.sum((measured - measured.mean(axis=0) - gain * seen) ** 2))
@@ -143,7 +164,8 @@ def _as_late_as_it_acts(motion: Motion, rotation: Rotation, inertia: np.ndarray)
         bounds=[(0.0, 0.3), (0.0, 0.4)],
         options={"xatol": 1e-3, "maxfev": 60},
     )
-    return acting(*found.x)
+    delay, tau = (float(x) for x in found.x)
+    return acting(delay, tau), (delay, tau)
 
 
 @dataclass(frozen=True)
@@ -165,7 +187,7 @@ class TorqueProblem:
         """The candidates; of an exclusive effect one for each parameter."""
         found: list[Choice] = []
         for effect in (self.effects[n] for n in self.candidates):
-            alone = [Choice(effect.name, (p.name,)) for p in effect.parameters]
+            alone = [Choice(effect.name, (p.name,)) for p in self._own_parameters(effect)]
             found += alone if effect.exclusive else [whole(effect)]
         return tuple(found)
 
@@ -181,9 +203,11 @@ class TorqueProblem:
 
     @cached_property
     def weight(self) -> np.ndarray:
-        """Of each axis (3,), s²/rad: one over what is left of it with all candidates fitted."""
-        everything = tuple(whole(self.effects[n]) for n in self.candidates)
-        left = self._solve(everything, np.ones(3)).residual
+        """Of each axis (A,), s²/rad: one over what is left of it with all candidates fitted."""
+        everything = tuple(
+            Choice(n, tuple(p.name for p in self._own_parameters(self.effects[n]))) for n in self.candidates
+        )
+        left = self._solve(everything, np.ones(len(self.turning.rotation.axes))).residual
         return 1.0 / np.maximum(np.sqrt(np.mean(left**2, axis=0)), 1e-9)
 
     def unit(self) -> float:
@@ -191,7 +215,7 @@ class TorqueProblem:
         return 1.0
 
     def column(self, name: str, parameter: Parameter) -> np.ndarray:
-        """Angular acceleration (K, 3) of a unit of the parameter: these effects are linear in theirs."""
+        """Angular acceleration (K, A) of a unit of the parameter: these effects are linear in theirs."""
         key = (name, parameter.name)
         if key not in self._seen:
             effect, motion = self.effects[name], self.turning.motion
@@ -201,6 +225,9 @@ class TorqueProblem:
             without = self.turning.columns(np.asarray(apply_effects(motion, [(effect, neutral)]).torque))
             self._seen[key] = (with_it - without) / (parameter.typical - neutral[parameter.name])
         return self._seen[key]
+
+    def _own_parameters(self, effect: Effect) -> tuple[Parameter, ...]:
+        return effect.parameters_of(self.turning.motion.vehicle)
 
     def _own(self, choice: Choice) -> list[Parameter]:
         return [p for p in self.effects[choice.effect].parameters if p.name in choice.parameters]
@@ -284,23 +311,23 @@ class TorqueProblem:
         """Residual of the rotors' torque alone, and of what was found, rad/s² over all axes."""
         r = self.turning.rotation
         residuals = (fitted.residual / self.weight for fitted in (before, after))
-        was, left, noise = (float(np.sqrt(np.mean(x**2))) for x in (*residuals, r.noise))
-        return RotationalRms(was, left, noise, r.bandwidth)
+        was, left, noise = (float(np.sqrt(np.mean(x**2))) for x in (*residuals, r.noise[list(r.axes)]))
+        return RotationalRms(was, left, noise, r.bandwidth, r.source)
 
 
 def _through_gains(
     measured: np.ndarray, linear: np.ndarray, shapes: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least squares of `measured` (K, 3) on the columns `linear` (K, 3, F), whose first three are the gains of the
-    control torque about each axis, and `shapes`, each (K, 3), which go through those gains as well: estimate (F + P),
-    derivative of the prediction (K, 3, F + P) and residual, by Gauss-Newton."""
-    fixed = linear.shape[2]
+    """Least squares of `measured` (K, A) on the columns `linear` (K, A, F), whose first A are the gains of the
+    control torque about each axis, and `shapes`, each (K, A), which go through those gains as well: estimate (F + P),
+    derivative of the prediction (K, A, F + P) and residual, by Gauss-Newton."""
+    fixed, axes = linear.shape[2], linear.shape[1]
     x = np.zeros(fixed + len(shapes))
-    x[:3] = 1.0
+    x[:axes] = 1.0
     for _ in range(12):
-        scaled = [c * x[:3] for c in shapes]
+        scaled = [c * x[:axes] for c in shapes]
         jacobian = np.concatenate([linear, *(c[:, :, None] for c in scaled)], axis=2)
-        for axis in range(3):  # an effect's torque, too, goes through the axis' gain
+        for axis in range(axes):  # an effect's torque, too, goes through the axis' gain
             for value, c in zip(x[fixed:], shapes, strict=True):
                 jacobian[:, axis, axis] += value * c[:, axis]
         predicted = linear @ x[:fixed] + sum(v * c for v, c in zip(x[fixed:], scaled, strict=True))

@@ -54,8 +54,11 @@ def diagnose(
     validation: Flight | None = None,
     bandwidth: float | None = None,
     progress: Callable[[str], None] = lambda _: None,
+    healthy: Sequence[Flight] = (),
 ) -> Diagnosis:
     """Find the effects that `base` lacks on `flight`, checked on held-out blocks and on `validation`.
+
+    `healthy` are flights of the same vehicle with which the share of each motor is compared.
 
     A network of `base` is held as it is: what it has learnt is not missing any more.
 
@@ -63,7 +66,7 @@ def diagnose(
     """
     # Its products are small: threads would wait for each other more than they compute.
     with threadpool_limits(1, user_api="blas"):
-        return _diagnose(flight, base, validation, bandwidth, progress)
+        return _diagnose(flight, base, validation, bandwidth, progress, healthy)
 
 
 def _diagnose(
@@ -72,6 +75,7 @@ def _diagnose(
     validation: Flight | None,
     bandwidth: float | None,
     progress: Callable[[str], None],
+    healthy: Sequence[Flight],
 ) -> Diagnosis:
     def measured(*measurements: Measurement) -> MeasuredFlights:
         return MeasuredFlights(measurements, base.effects_directory, base.network_chain())
@@ -79,7 +83,7 @@ def _diagnose(
     all_of_it = measured(measure(flight, bandwidth))
     held_out = None if validation is None else measured(measure(validation, bandwidth))
     progress("looking at the rotation")
-    rotation = judge_rotation(flight, base.names(), base.effects_directory)
+    rotation = judge_rotation(flight, base.names(), base.effects_directory, healthy)
     entire = ForceProblem(all_of_it, base, held_out, rotation.terms)
     parts = _spread(flight, bandwidth) if flight.duration > LONG else ()
     looked_at = replace(entire, flights=measured(*parts)) if parts else entire
@@ -160,6 +164,7 @@ def _report(search: Search, found: State, everything: Search, rotation: Rotation
         left_out=m.left_out,
         rotational=rotation.rms,
         alternatives=tuple(s.names for s in search.near(found)),
+        shares=rotation.shares,
     )
 
 

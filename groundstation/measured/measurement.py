@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 from scipy import ndimage, signal
 
+from trueflight.groundstation.measured.attitude_rate import that_turns
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.frames import rotate, rotate_inverse
@@ -59,7 +60,8 @@ class Rotation:
     """The measured rotation of a flight, ready to be compared.
 
     `value` (M, 3) is angular acceleration in body axes, rad/s², low-passed at `bandwidth` Hz and thinned to the rows
-    `rows` of the flight; `used` (M,), `t` (M,) in s, `smooth` and `noise` (3,) as in `Measurement`.
+    `rows` of the flight; `used` (M,), `t` (M,) in s, `smooth`, `noise` (3,) and `axes` as in `Measurement`. `flight`
+    has body rates in any case: `source` tells whether a "gyroscope" or the "attitude" gave them.
     """
 
     flight: Flight
@@ -70,17 +72,28 @@ class Rotation:
     smooth: Callable[[np.ndarray], np.ndarray]
     bandwidth: float
     noise: np.ndarray
+    axes: tuple[int, ...] = (0, 1, 2)
+    source: str = "gyroscope"
 
 
-def measure_rotation(flight: Flight) -> Rotation | None:
-    """The angular acceleration of `flight` from its gyroscope; None where it has none or is too short."""
-    fs = 1.0 / flight.dt
-    if flight.angular_velocity is None or flight.duration < SHORTEST:
+def measure_rotation(flight: Flight, bandwidth: float = ROTATION_BANDWIDTH) -> Rotation | None:
+    """The angular acceleration of `flight` below `bandwidth` Hz, from its gyroscope or else from its attitude; None
+    where it has neither or is too short.
+
+    An attitude holds up to where its noise has the greater part, which is the bandwidth then.
+    """
+    if flight.duration < SHORTEST:
         return None
-    bandwidth = min(ROTATION_BANDWIDTH, 0.4 * fs)
+    fs = 1.0 / flight.dt
+    pieces = _pieces(flight)
+    bandwidth = min(bandwidth, 0.4 * fs)
+    flight, from_attitude = that_turns(flight, pieces, bandwidth)
+    if flight.angular_velocity is None:
+        return None
+    if from_attitude is not None:
+        bandwidth = from_attitude.band
     sos = signal.butter(4, bandwidth, fs=fs, output="sos")
     rows = np.arange(0, len(flight), max(1, int(fs / (2.5 * bandwidth))))
-    pieces = _pieces(flight)
 
     def smooth(x: np.ndarray) -> np.ndarray:
         return _low_pass(x, sos, pieces, fs)[rows]
@@ -100,7 +113,12 @@ def measure_rotation(flight: Flight) -> Rotation | None:
         used=used[rows],
         smooth=smooth,
         bandwidth=bandwidth,
-        noise=_noise(flight.angular_velocity, used, sos, fs, True),
+        noise=_noise(
+            flight.angular_velocity if from_attitude is None else from_attitude.rough, used, sos, fs, True
+        ),
+        # an angle that was made of accelerations is no attitude to differentiate
+        axes=(0, 2) if from_attitude is not None and "pitch" in flight.unlogged else (0, 1, 2),
+        source="gyroscope" if from_attitude is None else "attitude",
     )
 
 

@@ -13,6 +13,7 @@ from trueflight.groundstation.results import (
     Comparison,
     Diagnosis,
     EffectVerdict,
+    MotorShares,
     ParameterEstimate,
     SharedNumber,
     WaterfallStep,
@@ -105,6 +106,8 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
     }
     if d.rotational is not None:
         table["rotational_rms"] = {**asdict(d.rotational), "unit": "rad/s^2"}
+    if d.shares is not None:
+        table["motor_shares"] = shares_table(d.shares)
     if d.validation_before is not None:
         table["validation_rms"] = {"before": d.validation_before, "after": d.validation_after, "unit": UNIT}
     return plain(table)
@@ -175,6 +178,21 @@ def fleet_table(fleet: Fleet) -> dict[str, Any]:
         for h in fleet.histories
     ]
     return {**asdict(fleet), "histories": vehicles}
+
+
+def shares_table(shares: MotorShares) -> dict[str, Any]:
+    """The JSON of what each rotor carries."""
+    return {
+        "shares": list(shares.shares),
+        "half_widths": list(shares.errors),
+        "uneven": shares.uneven,
+        "compared_with": list(shares.compared_with),
+        "changes": list(shares.changes),
+        "collective": shares.collective,
+        "rotor": shares.rotor or None,
+        "excess": {"value": shares.excess, "low": shares.excess_low, "high": shares.excess_high},
+        "text": shares.told,
+    }
 
 
 def consistency_table(flight: Flight) -> list[dict[str, Any]]:

@@ -136,10 +136,19 @@ def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) ->
         console.print(remark, style="yellow", highlight=False)
     if d.rotational is not None:
         r = d.rotational
-        console.print(
-            f"angular acceleration {r.before:.3f} -> {r.after:.3f} rad/s² (noise floor {r.noise_floor:.3f})",
-            highlight=False,
+        told = (
+            f"angular acceleration {r.before:.3f} -> {r.after:.3f} rad/s² (noise floor {r.noise_floor:.3f})"
         )
+        if r.source == "attitude":
+            told += f", from the attitude, which holds up to {r.bandwidth:.1f} Hz: no gyroscope was logged"
+        console.print(told, highlight=False)
+    if d.shares is not None:
+        carried = " ".join(f"{100 * x:.1f}" for x in d.shares.shares)
+        style = "yellow" if d.shares.rotor else ""
+        console.print(
+            f"each rotor's part of the thrust, %: {carried}" + (f"; {d.shares.told}" if d.shares.told else ""),
+            style=style, highlight=False,
+        )  # fmt: skip
     for names in d.alternatives:
         console.print(f"As well explained by {' with '.join(names)}", style="yellow", highlight=False)
     if d.unexplained.verdict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from trueflight.groundstation.reading.assemble import assemble
@@ -90,11 +91,12 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Give
     whole = merged(mappings)
     if whole is not None and (whole.names_columns or "t" not in table.columns):
         mapped = apply_mapping(table, whole, believed)
-        return assemble(
+        flight = assemble(
             path, believed, mapped.t, mapped.columns, table.place,
             extra=mapped.extra, flying=None, notes=(*table.notes, *mapped.notes),
             accelerometer=not mapped.estimated_force, named_by=whole,
         )  # fmt: skip
+        return replace(flight, unlogged=mapped.unlogged)
     columns = own_columns(table)
     extra = unknown_columns(table)
     flying = table.columns["flying"] > 0.5 if "flying" in table.columns else None

@@ -131,13 +131,15 @@ class Mapping:
 @dataclass(frozen=True)
 class MappedTable:
     """A foreign table in the project's names, units and frames; `extra` are the columns that nothing
-    claimed, `estimated_force` whether its specific force is an estimator's and no accelerometer's."""
+    claimed, `estimated_force` whether its specific force is an estimator's and no accelerometer's, `unlogged` the
+    angles of its attitude that were made of other columns."""
 
     t: np.ndarray
     columns: dict[str, np.ndarray]
     extra: dict[str, np.ndarray]
     notes: tuple[str, ...]
     estimated_force: bool = False
+    unlogged: tuple[str, ...] = ()
 
 
 def read_mappings(given: Given) -> tuple[Mapping, ...]:
@@ -239,7 +241,9 @@ def apply_mapping(table: Table, mapping: Mapping, vehicle: Vehicle) -> MappedTab
         notes.append("the specific force is the logged world acceleration plus gravity, in body axes")
     columns = _mended(mapping, t, columns)
     extra = {name: column for name, column in table.columns.items() if name not in used}
-    return MappedTable(t - t[0], columns, extra, tuple(notes), world is not None)
+    made = mapping.quantities.get("attitude", {}).get("pitch") == "from_acceleration"
+    unlogged = ("pitch",) if made and "quaternion" in columns else ()
+    return MappedTable(t - t[0], columns, extra, tuple(notes), world is not None, unlogged)
 
 
 def left_out(mapping: Mapping | None) -> set[str]:

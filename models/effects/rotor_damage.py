@@ -2,31 +2,55 @@
 
 from collections.abc import Mapping
 
+import numpy as np
 from array_api_compat import array_namespace
 
 from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.flight import MOST_ROTORS
+from trueflight.models.vehicle import Vehicle
+
+ROTORS = 4
+"""Rotors of a vehicle whose file does not tell them."""
 
 
-def formula(motion: Motion, *, loss_1: Array, loss_2: Array, loss_3: Array, loss_4: Array) -> Motion:
+def formula(motion: Motion, **losses: Array) -> Motion:
     """`f_i' = (1 - loss_i) f_i` of rotor i: its torque about the centre of mass and its thrust are lost together.
 
-    `loss_1`, `loss_2`, `loss_3` and `loss_4` are shares, 0 to 1, in the order of the vehicle's rotor_positions.
+    `losses`, `loss_1`, `loss_2` and so on, are shares, 0 to 1, in the order of the vehicle's rotor_positions; those of
+    rotors that it does not have do nothing.
 
-    Where nothing tells the rotors apart, the rotor is believed to be driven so much harder that roll, pitch and yaw
-    stay balanced, and the thrust of all is `4 (1 - loss) / (4 - 3 loss)` of the commanded.
+    Where nothing tells the rotors apart, the vehicle is believed to be driven so that roll, pitch and yaw stay
+    balanced: of four rotors the weaker is driven so much harder, and the thrust of all is
+    `4 (1 - loss) / (4 - 3 loss)` of the commanded.
     """
-    losses = (loss_1, loss_2, loss_3, loss_4)
     if motion.rotor_thrust is None:
         factor = 1.0
-        for loss in losses:
-            factor = factor * 4.0 * (1.0 - loss) / (4.0 - 3.0 * loss)
+        lever = leverage(motion.vehicle)
+        for i, h in enumerate(lever):
+            loss = losses.get(f"loss_{i + 1}", 0.0)
+            factor = factor * (1.0 - h * loss) / (1.0 - h * loss + loss / len(lever))
         return motion.with_(thrust=motion.thrust * factor)
     xp = array_namespace(motion.rotor_thrust)
-    each = [(1.0 - loss) * motion.rotor_thrust[:, i] for i, loss in enumerate(losses)]
-    each += [motion.rotor_thrust[:, i] for i in range(len(losses), motion.rotor_thrust.shape[1])]
+    count = motion.rotor_thrust.shape[1]
+    each = [(1.0 - losses.get(f"loss_{i + 1}", 0.0)) * motion.rotor_thrust[:, i] for i in range(count)]
     weaker = xp.stack(each, axis=-1)
     share = xp.sum(weaker, axis=1) / xp.clip(xp.sum(motion.rotor_thrust, axis=1), 1e-9, None)
     return motion.with_(thrust=motion.thrust * share, rotor_thrust=weaker)
+
+
+def leverage(vehicle: Vehicle) -> tuple[float, ...]:
+    """How much of each rotor's own thrust the allocation makes good by that rotor: 1 where there are four, for nothing
+    else can; with more, roll, pitch, yaw and thrust are shared out by the pseudo-inverse of their matrix B, and it is
+    the diagonal of `pinv(B) B`.
+
+    With the rotor's loss l the allocation asks for `1 / n l / (1 - h l)` more thrust than acts (Sherman-Morrison).
+    """
+    count = len(vehicle.rotor_positions)
+    if not count:
+        return (1.0,) * ROTORS
+    x, y, _ = np.array(vehicle.rotor_positions, dtype=float).T
+    allocation = np.stack([np.ones(count), y, -x, -np.array(vehicle.rotor_directions, dtype=float)])
+    return tuple(float(h) for h in np.diag(np.linalg.pinv(allocation) @ allocation))
 
 
 def truth(hidden: Mapping[str, float], neutral: Mapping[str, float]) -> dict[str, float]:
@@ -50,8 +74,9 @@ EFFECT = Effect(
             0.7,
             grows=f"rotor {i} has lost {{:.0%}} of its thrust",
             shrinks=f"rotor {i} has regained {{:.0%}} of its thrust",
+            rotor=i,
         )
-        for i in (1, 2, 3, 4)
+        for i in range(1, MOST_ROTORS + 1)
     ),
     needs=("angular_velocity", "thrust_command"),
     manoeuvre="rolls, pitches and yaws both ways with some change of thrust: the rotors must take different loads",

@@ -169,12 +169,12 @@ def test_without_rotor_data_an_offset_centre_of_mass_cannot_be_seen(folder) -> N
     assert "integral" in verdict(result, "com_offset").advice
 
 
-def test_motor_commands_serve_where_rotor_speeds_are_missing(folder) -> None:
+def test_motor_commands_serve_where_rotor_speeds_are_missing_but_motors_differ(folder) -> None:
     flight, hidden = flown(folder, "com_offset")
     train = (flight.rotor_speed / np.mean(flight.rotor_speed)) ** 2
     commands = flight.vehicle.hover_thrust * train  # as an autopilot logs them, on a linear thrust model
     result = diagnosis(replace(flight, rotor_speed=None, motor_command=commands))
-    assert result.named("missing") == ("com_offset",)
+    assert verdict(result, "com_offset").verdict == "minor"  # motors of one set that differ do as much
     found = {p.name: p for p in verdict(result, "com_offset").parameters}
     for axis in "xy":
         assert found[axis].value == pytest.approx(hidden[0].parameters[axis], rel=0.02, abs=1e-5)
