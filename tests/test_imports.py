@@ -15,9 +15,9 @@ ALLOWED = {
     "models": {"array_api_compat", "mcap", "lz4", "zstandard", "google"},
     "companion": {"trueflight.companion", "mavsdk", "zenoh", "onnxruntime", "mcap", "google"},
     "groundstation": {
-        "trueflight.groundstation", "torch", "control", "scipy", "rerun", "pyarrow", "pyulog", "pymavlink", "onnx",
-        "onnxruntime", "mcap", "mcap_ros2", "google", "zenoh", "jinja2", "markupsafe", "matplotlib", "pandas", "dask",
-        "distributed", "cryptography", "threadpoolctl",
+        "trueflight.groundstation", "torch", "control", "scipy", "rerun", "pyarrow", "pyulog", "pymavlink", "rosbags",
+        "onnx", "onnxruntime", "mcap", "mcap_ros2", "zstandard", "google", "zenoh", "jinja2", "markupsafe",
+        "matplotlib", "pandas", "dask", "distributed", "cryptography", "threadpoolctl",
     },
     "sim_bridge": {
         "trueflight.sim_bridge", "trueflight.companion", "mujoco", "pymavlink", "scipy", "mcap", "google",

@@ -117,7 +117,7 @@ def import_command(
 ) -> None:
     """Read any flight, check it, and write it in the project's own format with its vehicle file beside it.
 
-    typer.Option("--draft-vehicle", help="Draft a vehicle file from a log's parameters; never replaces one."),
+    From an autopilot's log (ULog, ArduPilot) a vehicle file can be drafted first: `--draft-vehicle vehicle.toml`.
     """
     from trueflight.groundstation.output.as_json import draft_table, imported_table
     from trueflight.groundstation.reading import read_flight

@@ -6,8 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from trueflight.groundstation.reading.assemble import assemble
+from trueflight.groundstation.reading.betaflight_table import BLACKBOX, CONVERT, blackbox_mapping
+from trueflight.groundstation.reading.crazyflie_log import TIME as CRAZYFLIE_TIME
+from trueflight.groundstation.reading.crazyflie_log import is_usd_log, read_usd_log, usd_mapping
 from trueflight.groundstation.reading.mapping import (
     Given,
+    Mapping,
     apply_mapping,
     load_mapping,
     merged,
@@ -21,7 +25,7 @@ from trueflight.models.outside import unreadable
 from trueflight.models.vehicle import Vehicle, load_vehicle
 
 TABLES = (".csv", ".txt", ".tsv", ".parquet", ".pq")
-RECORDS = (".mcap",)
+RECORDS = (".mcap", ".db3")
 ULOGS = (".ulg", ".ulog")
 DATAFLASH = (".bin",)
 ENDINGS = (*RECORDS, *TABLES, *ULOGS, *DATAFLASH)
@@ -80,14 +84,40 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Give
 
         refuse_topics(sources, path)
         return flight_of(path, load_dataflash(path), _vehicle(path, vehicle), corrections)
-    if suffix not in TABLES:
-        raise InputError(f"{path}: '{suffix}' is no kind of flight file; known are {', '.join(ENDINGS)}")
+    if suffix in BLACKBOX:
+        raise InputError(f"{path}: {CONVERT}")
+    on_card = is_usd_log(path)
+    if suffix not in TABLES and not on_card:
+        raise InputError(
+            f"{path}: '{suffix}' is no kind of flight file; known are {', '.join(ENDINGS)} and the logs of a "
+            "Crazyflie's card"
+        )
     refuse_topics(sources, path)
-    table = read_table(path)
+    return _of_table(
+        path, read_usd_log(path) if on_card else read_table(path), vehicle, mappings, corrections
+    )
+
+
+def is_flight_file(path: Path) -> bool:
+    """Whether a file of a folder is taken for a flight: by its ending, or, where it has none, by how it begins."""
+    return path.suffix.lower() in ENDINGS or (not path.suffix and is_usd_log(path))
+
+
+def _of_table(
+    path: Path,
+    table: Table,
+    vehicle: str | Path | Vehicle | None,
+    mappings: tuple[Mapping, ...],
+    corrections: Mapping | None,
+) -> Flight:
+    """The flight of a table: its columns named by a mapping, by whoever wrote it, or as the project's own."""
     believed = _vehicle(path, vehicle)
-    beside = _mapping_beside(path, table)
+    table, known = _known(table)
+    beside = None if known is not None else _mapping_beside(path, table)
     if beside is not None and not any(one.names_columns for one in mappings):
         mappings = (load_mapping(beside), *mappings)
+    if known is not None and not any(one.names_columns for one in mappings):
+        mappings = (known, *mappings)
     whole = merged(mappings)
     if whole is not None and (whole.names_columns or "t" not in table.columns):
         mapped = apply_mapping(table, whole, believed)
@@ -111,6 +141,13 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Give
         notes=table.notes,
         mapping=corrections,
     )
+
+
+def _known(table: Table) -> tuple[Table, Mapping | None]:
+    """The table, and what its columns are where it is told by the names that another program gives them."""
+    if CRAZYFLIE_TIME in table.columns and table.first_line is None:
+        return table, usd_mapping(table)
+    return blackbox_mapping(table) or (table, None)
 
 
 def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:

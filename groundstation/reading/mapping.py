@@ -79,6 +79,7 @@ UNITS: dict[str, dict[str, tuple[float, float]]] = {
         "rad/s": (1.0, 0.0),
         "deg/s": (np.pi / 180, 0.0),
         "mdeg/s": (np.pi / 180000, 0.0),
+        "mrad/s": (1e-3, 0.0),
         "rpm": (np.pi / 30, 0.0),
         "rev/s": (2 * np.pi, 0.0),
     },

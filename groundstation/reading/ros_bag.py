@@ -1,4 +1,4 @@
-"""MCAP recordings of ROS 2: PX4's messages, and the usual ones of ROS brought to PX4's.
+"""Recordings of ROS 2, in MCAP or SQLite: PX4's messages, and the usual ones of ROS brought to PX4's.
 
 Of `px4_msgs` every topic that a ULog has is read, whatever its namespace (`/fmu/out/vehicle_attitude`,
 `/px4_1/fmu/out/vehicle_status_v1`). `nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `sensor_msgs/Imu`,
@@ -9,6 +9,7 @@ missing: ENU and FLU (REP 103), unless their frame is named NED.
 from __future__ import annotations
 
 import re
+import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Header, Message, Schema
 
+from trueflight.groundstation.reading import ros_db3
 from trueflight.groundstation.reading.clocks import drift_of, of_one_clock
 from trueflight.groundstation.reading.px4_log import TOPICS, Log, collect
 from trueflight.groundstation.reading.ros_choice import choose
@@ -29,6 +31,9 @@ from trueflight.models.frames import enu_flu_from_ned_frd, enu_from_ned, flu_fro
 from trueflight.models.mcap_records import mcap_records
 
 ADVICE = "record it with `ros2 bag record --storage mcap`, with the px4_msgs workspace sourced"
+DB3 = ".db3"
+"""How a bag in SQLite ends."""
+ADVICE_DB3 = "bags from before Iron hold none: `ros2 bag convert` to MCAP, with the workspace of these messages sourced"
 OTHER_CLOCK = 0.5
 """s; stamps further apart from the times of receipt than others count another clock: since boot, not since 1970, or
 that of a computer that was not synchronised."""
@@ -53,7 +58,9 @@ class _Recorded:
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Whether an MCAP file holds ROS 2 messages."""
+    """Whether a file holds ROS 2 messages: MCAP by what is in it, SQLite by its ending."""
+    if path.suffix.lower() == DB3:
+        return True
     try:
         with path.open("rb") as stream:
             for record in mcap_records(stream, []):
@@ -71,7 +78,7 @@ def load_ros_bag(path: Path, wanted: Sources | None = None) -> Log:
 
     Raises `InputError` for one that holds none of them, and where nothing tells which of several to take.
     """
-    recorded, seen, notes = _read(path)
+    recorded, seen, notes = _read_db3(path) if path.suffix.lower() == DB3 else _read(path)
     notes += _one_clock(recorded)
     chosen = choose(str(path), [_source(one) for one in recorded], wanted or Sources())
     notes += chosen.notes
@@ -126,7 +133,7 @@ def _read(path: Path) -> tuple[list[_Recorded], str, list[str]]:
                     seen[record.topic] = kind
                     if record.id in channels or not _usable(record.topic, kind):
                         continue
-                    decode = _decoder(factory, record, schema)
+                    decode = _decoder(factory, record.message_encoding, schema)
                     if decode is None:
                         unreadable.append(record.topic)
                         continue
@@ -150,6 +157,51 @@ def _read(path: Path) -> tuple[list[_Recorded], str, list[str]]:
     return kept, shown, notes
 
 
+def _read_db3(path: Path) -> tuple[list[_Recorded], str, list[str]]:
+    """As `_read`, of a bag in SQLite."""
+    from mcap_ros2.decoder import DecoderFactory
+
+    factory = DecoderFactory()
+    found: dict[int, tuple[_Recorded, Callable[[bytes], Any]]] = {}
+    unreadable: list[str] = []
+    seen: list[str] = []
+    garbled: dict[str, int] = {}
+    cut = ""
+    try:
+        with ros_db3.opened(path) as bag:
+            for topic in ros_db3.topics(bag):
+                seen.append(topic.name)
+                if not _usable(topic.name, topic.kind):
+                    continue
+                schema = Schema(topic.number, topic.definition.encode(), "ros2msg", topic.kind)
+                decode = _decoder(factory, "cdr", schema) if topic.definition else None
+                if decode is None:
+                    unreadable.append(topic.name)
+                    continue
+                found[topic.number] = _Recorded(topic.name, topic.kind), decode
+            for number, received, data in ros_db3.messages(bag, list(found)):
+                one, decode = found[number]
+                try:
+                    _append(one, received, decode(data))
+                except Exception:  # noqa: BLE001 - a message of another definition, or damaged: the others are whole
+                    garbled[one.topic] = garbled.get(one.topic, 0) + 1
+    except sqlite3.Error as error:
+        if not found:
+            raise InputError(
+                f"{path}: no ROS 2 bag ({str(error) or type(error).__name__}); {ADVICE}"
+            ) from None
+        cut = f"it is damaged ({str(error) or type(error).__name__})"
+    notes = [f"the recording is not whole: {cut}; what came before was read"] if cut else []
+    if unreadable:
+        notes.append(f"no readable definition of {', '.join(unreadable[:4])} in the recording; {ADVICE_DB3}")
+    notes += [
+        f"{count} messages of {topic} do not fit their definition: left out"
+        for topic, count in garbled.items()
+    ]
+    shown = ", ".join(sorted(seen)[:8]) + (" ..." if len(seen) > 8 else "")
+    return [one for one, _ in found.values() if len(one.rows) > 1], shown, notes
+
+
 def _usable(topic: str, kind: str) -> bool:
     if kind.startswith("px4_msgs/"):
         return _px4_name(topic) in TOPICS
@@ -161,9 +213,9 @@ def _px4_name(topic: str) -> str:
     return re.sub(r"_v\d+$", "", topic.rsplit("/", 1)[-1])
 
 
-def _decoder(factory: Any, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any] | None:
+def _decoder(factory: Any, encoding: str, schema: Schema | None) -> Callable[[bytes], Any] | None:
     try:
-        decode: Callable[[bytes], Any] | None = factory.decoder_for(channel.message_encoding, schema)
+        decode: Callable[[bytes], Any] | None = factory.decoder_for(encoding, schema)
     except Exception:  # noqa: BLE001 - a definition that does not parse raises whatever its parser meets
         return None
     return decode

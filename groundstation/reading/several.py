@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from trueflight.groundstation.reading.flight_file import ENDINGS, read_flight
+from trueflight.groundstation.reading.flight_file import ENDINGS, is_flight_file, read_flight
 from trueflight.groundstation.reading.mapping import Given
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -72,9 +72,7 @@ def flight_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; pass the one that holds your flights")
     return sorted(
-        f
-        for f in folder.rglob("*")
-        if f.suffix.lower() in ENDINGS and f.is_file() and not is_hidden(f, folder)
+        f for f in folder.rglob("*") if f.is_file() and is_flight_file(f) and not is_hidden(f, folder)
     )
 
 
@@ -91,7 +89,8 @@ def _one_each(folder: Path) -> list[Path]:
 
 
 def _rank(file: Path) -> int:
-    return ENDINGS.index(file.suffix.lower())
+    suffix = file.suffix.lower()
+    return ENDINGS.index(suffix) if suffix in ENDINGS else len(ENDINGS)
 
 
 def _vehicle_file(flight: Flight) -> Path | None:

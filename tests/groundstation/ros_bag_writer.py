@@ -1,8 +1,11 @@
-"""MCAP recordings of ROS 2 for tests: PX4's messages, MAVROS', a motion capture's."""
+"""Recordings of ROS 2 for tests: PX4's messages, MAVROS', a motion capture's."""
 
+import sqlite3
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from mcap_ros2._dynamic import serialize_dynamic
 from mcap_ros2.writer import Writer
 from px4_layouts import Flown, flown
 from ulog_writer import TYPES, Written
@@ -85,6 +88,36 @@ class Bag:
                 writer.write_message(topic, schemas[kind], message, log_time=round(1e9 * (EPOCH + t)))
             writer.finish()
         return self.path
+
+
+TABLES = (
+    "topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, offered_qos_profiles TEXT)",
+    "messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)",
+    "message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT, encoding TEXT, encoded_message_definition TEXT, "
+    "type_description_hash TEXT)",
+)
+
+
+def as_db3(bag: Bag, path: Path, definitions: bool = True) -> Path:
+    """The recording as rosbag2's SQLite storage keeps it, with the definitions of its messages or without."""
+    store = sqlite3.connect(path)
+    for table in TABLES[: 2 + definitions]:
+        store.execute(f"CREATE TABLE {table}")
+    told = {kind: definition for _, _, kind, definition, _ in bag.pending}
+    if definitions:
+        rows = [(number, kind, "ros2msg", text, "") for number, (kind, text) in enumerate(told.items())]
+        store.executemany("INSERT INTO message_definitions VALUES (?, ?, ?, ?, ?)", rows)
+    encode = {kind: serialize_dynamic(kind, definition)[kind] for kind, definition in told.items()}
+    numbers: dict[str, int] = {}
+    for t, topic, kind, _, message in sorted(bag.pending, key=lambda entry: entry[0]):
+        if topic not in numbers:
+            numbers[topic] = len(numbers) + 1
+            store.execute("INSERT INTO topics VALUES (?, ?, ?, 'cdr', '')", (numbers[topic], topic, kind))
+        row = (numbers[topic], round(1e9 * (EPOCH + t)), bytes(encode[kind](message)))
+        store.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", row)
+    store.commit()
+    store.close()
+    return path
 
 
 def px4_topics(

@@ -1,4 +1,4 @@
-"""MCAP of ROS 2: PX4's messages make the same flight as its ULog; ROS' own stand in where they are missing."""
+"""Recordings of ROS 2: PX4's messages make the same flight as its ULog; ROS' own stand in where they are missing."""
 
 import json
 import subprocess
@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from px4_layouts import BOOT, flown, log_of, middle_of
-from ros_bag_writer import EPOCH, HEADER, Bag, poses, px4_topics, ros_messages
+from ros_bag_writer import EPOCH, HEADER, Bag, as_db3, poses, px4_topics, ros_messages
 
 from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.reading.ros_bag import load_ros_bag
 from trueflight.models.errors import InputError
 from trueflight.models.vehicle import Vehicle
 
@@ -50,6 +51,40 @@ def test_odometry_and_imu_of_ros_stand_in(twist_in_world, tmp_path):
     assert flight.battery_voltage is not None
     rows, same = middle_of(flight, flown())
     np.testing.assert_allclose(flight.body_rate_command[rows], flown().body_rate_command[same], atol=0.2)
+
+
+@pytest.mark.parametrize("definitions", [True, False])
+def test_a_bag_in_sqlite_is_the_same_flight(definitions, tmp_path):
+    """Without definitions, as bags from before Iron are, ROS' own messages are known, and others are told."""
+    made = ros_messages(Bag(tmp_path / "bag.mcap"))
+    path = as_db3(made, tmp_path / "bag_0.db3", definitions)
+    if not definitions:
+        with pytest.raises(InputError, match=r"no thrust command") as error:
+            read_flight(path, VEHICLE)
+        assert "\n" not in str(error.value)
+        return
+    flight, same = read_flight(path, VEHICLE), read_flight(made.save(), VEHICLE)
+    agrees(flight)
+    np.testing.assert_array_equal(flight.specific_force, same.specific_force)
+
+
+def test_ros_own_messages_are_read_from_a_bag_without_definitions(tmp_path):
+    path = as_db3(ros_messages(Bag(tmp_path / "bag.mcap")), tmp_path / "bag_0.db3", definitions=False)
+    log = load_ros_bag(path)
+    assert {"vehicle_local_position", "sensor_combined"} <= set(log.topics)
+    assert any("no readable definition" in note and "ros2 bag convert" in note for note in log.notes)
+
+
+def test_a_bag_that_is_damaged_is_read_as_far_as_it_goes_or_told(tmp_path):
+    path = as_db3(ros_messages(Bag(tmp_path / "bag.mcap")), tmp_path / "bag_0.db3")
+    raw = path.read_bytes()
+    for name, broken in (("half", raw[: len(raw) // 2]), ("none", b"no database"), ("empty", b"")):
+        cut = tmp_path / f"{name}.db3"
+        cut.write_bytes(broken)
+        try:
+            read_flight(cut, VEHICLE)
+        except InputError as error:
+            assert str(cut) in str(error) and "\n" not in str(error)
 
 
 def test_a_pose_alone_gives_a_flight_whose_velocity_is_differentiated(tmp_path):
