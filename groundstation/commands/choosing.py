@@ -10,7 +10,9 @@ import typer
 
 NamespaceOption = Annotated[
     str | None,
-    typer.Option("--vehicle-namespace", help="Of several vehicles in a ROS 2 recording: the one to read."),
+    typer.Option(
+        "--vehicle-namespace", help="Of several vehicles in a ROS 2 recording or a .tlog: the one to read."
+    ),
 ]
 TopicOption = Annotated[
     list[str] | None,

@@ -164,8 +164,16 @@ def motor_commands(log: Dataflash, parameters: dict[str, float], count: int) -> 
     outputs = log.messages("RCOU")
     if outputs is None:
         return []
-    columns = [outputs.field(f"C{c + 1}", f"Ch{c + 1}", f"Chan{c + 1}") for c in _channels(parameters, count)]
-    if any(one is None for one in columns):
+    columns = {c: outputs.field(f"C{c + 1}", f"Ch{c + 1}", f"Chan{c + 1}") for c in range(32)}
+    return of_pulses(outputs.t, {c: v for c, v in columns.items() if v is not None}, parameters, count)
+
+
+def of_pulses(
+    t: np.ndarray, outputs: dict[int, np.ndarray], parameters: dict[str, float], count: int
+) -> list[tuple[str, int, Fields]]:
+    """Motor commands at times `t` (M,) in us of the pulses (M,) of each output, from 0 on."""
+    channels = _channels(parameters, count)
+    if not all(channel in outputs for channel in channels):
         return []
     low, high = parameters.get("MOT_PWM_MIN", 0.0), parameters.get("MOT_PWM_MAX", 0.0)
     if int(parameters.get("MOT_PWM_TYPE", 0)) in DSHOT:
@@ -174,16 +182,13 @@ def motor_commands(log: Dataflash, parameters: dict[str, float], count: int) -> 
         low, high = parameters.get("RC3_MIN", 1000.0), parameters.get("RC3_MAX", 2000.0)
     if not high > low:
         return []
-    pulse = np.stack([one for one in columns if one is not None], -1)
+    pulse = np.stack([outputs[channel] for channel in channels], -1)
     signal = (pulse - low) / (high - low)
     if "MOT_SPIN_MIN" in parameters or "MOT_SPIN_MAX" in parameters:  # from 3.5 on
-        least, most = (
-            parameters.get("MOT_SPIN_MIN", DEFAULT_SPIN_MIN),
-            parameters.get("MOT_SPIN_MAX", DEFAULT_SPIN_MAX),
-        )
-        signal = (signal - least) / max(most - least, 0.1)
+        least = parameters.get("MOT_SPIN_MIN", DEFAULT_SPIN_MIN)
+        signal = (signal - least) / max(parameters.get("MOT_SPIN_MAX", DEFAULT_SPIN_MAX) - least, 0.1)
     thrust = _thrust(np.clip(signal, 0.0, 1.0), parameters.get("MOT_THST_EXPO", 0.0))
-    fields: Fields = {"timestamp": outputs.t, **{f"control[{i}]": thrust[:, i] for i in range(count)}}
+    fields: Fields = {"timestamp": t, **{f"control[{i}]": thrust[:, i] for i in range(count)}}
     return [("actuator_motors", 0, fields)]
 
 

@@ -28,7 +28,8 @@ TABLES = (".csv", ".txt", ".tsv", ".parquet", ".pq")
 RECORDS = (".mcap", ".db3")
 ULOGS = (".ulg", ".ulog")
 DATAFLASH = (".bin",)
-ENDINGS = (*RECORDS, *TABLES, *ULOGS, *DATAFLASH)
+TELEMETRY = (".tlog",)
+ENDINGS = (*RECORDS, *TABLES, *ULOGS, *DATAFLASH, *TELEMETRY)
 """Best first: of files of a folder that differ in their ending only, the first of these is read."""
 
 
@@ -84,6 +85,12 @@ def _read_flight(path: Path, vehicle: str | Path | Vehicle | None, mapping: Give
 
         refuse_topics(sources, path)
         return flight_of(path, load_dataflash(path), _vehicle(path, vehicle), corrections)
+    if suffix in TELEMETRY:
+        from trueflight.groundstation.reading.mavlink_log import load_tlog
+        from trueflight.groundstation.reading.px4_flight import flight_of
+
+        refuse_topics(Sources(topics=sources.topics), path)
+        return flight_of(path, load_tlog(path, sources), _vehicle(path, vehicle), corrections)
     if suffix in BLACKBOX:
         raise InputError(f"{path}: {CONVERT}")
     on_card = is_usd_log(path)
@@ -159,7 +166,7 @@ def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:
         return load_vehicle(beside)
     draft = (
         f"; `groundstation import {path} --draft-vehicle {path.with_name('vehicle.toml')}` drafts one"
-        if path.suffix.lower() in (*ULOGS, *DATAFLASH)
+        if path.suffix.lower() in (*ULOGS, *DATAFLASH, *TELEMETRY)
         else ""
     )
     raise InputError(

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from trueflight.groundstation.reading.ardupilot_log import load_dataflash
-from trueflight.groundstation.reading.flight_file import DATAFLASH, ULOGS
+from trueflight.groundstation.reading.flight_file import DATAFLASH, TELEMETRY, ULOGS
+from trueflight.groundstation.reading.mavlink_log import load_tlog
 from trueflight.groundstation.reading.px4_airborne import (
     RATE,
     Airborne,
@@ -49,6 +50,7 @@ NAMED = "give it your own name (it is part of Zenoh keys)"
 LOADERS: dict[str, Callable[[Path], Log]] = {
     **dict.fromkeys(ULOGS, load_ulog),
     **dict.fromkeys(DATAFLASH, load_dataflash),
+    **dict.fromkeys(TELEMETRY, load_tlog),
 }
 """What reads the logs that hold parameters, by their ending."""
 
