@@ -407,10 +407,35 @@ class Search:
             equal = evidence(self.problem, current.fit, other.fit) < STRONG_EVIDENCE
             if equal and self.evident(other, self.without(current, choice)):
                 found.append(rival.effect)
+        found += [n for n in dict.fromkeys(self._carried(current, choice)) if n not in found]
         for other in self.near(current):
             if choice.effect not in other.names:
                 found += [n for n in other.names if n not in {*current.names, *found}]
         return tuple(found)
+
+    def _carried(self, current: State, choice: Choice) -> Iterator[str]:
+        """Effects that could stand in for `choice` with another that they act through, and which is not there: wind
+        across a hover, with drag."""
+        if choice in self.problem.settled or any(not self._acts(c, ()) for c in current.choices):
+            return
+        rest = [c for c in current.choices if c != choice]
+        without = self.without(current, choice)
+        lost = without.fit.sse - current.fit.sse
+        unit = variance_per_independent_sample(self.problem, current.fit.residual)
+        known = self.problem.effects[choice.effect].confounded_with
+        for step in self._steps(without):
+            if len(step) < 2 or choice in step or step[-1].effect not in known:
+                continue
+            near = LINEARISED * self.problem.linearised_gain(without.fit, step)
+            if near < lost and (lost - near) / unit > LINEARISED * STRONG_EVIDENCE:
+                continue
+            other = self.state((*rest, *step))
+            if (
+                all(plausible(other.fit, c.effect) for c in step)
+                and evidence(self.problem, current.fit, other.fit) < STRONG_EVIDENCE
+                and self.evident(other, without)
+            ):
+                yield step[-1].effect
 
     def _standing_in(self, current: State, choice: Choice) -> Iterator[Choice]:
         """Candidates that could take the place of one that was found, by their linearisation."""

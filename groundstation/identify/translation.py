@@ -7,6 +7,7 @@ between command and rotors.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -20,6 +21,8 @@ from trueflight.groundstation.identify.fitting import (
     model_of,
 )
 from trueflight.groundstation.identify.force import ForceProblem, mean_square_before
+from trueflight.groundstation.identify.lateness import late_instead
+from trueflight.groundstation.identify.one_by_one import shares, with_shares
 from trueflight.groundstation.identify.rates import judge_rates
 from trueflight.groundstation.identify.remainder import unexplained
 from trueflight.groundstation.identify.ridges import ridges, with_ridges
@@ -29,6 +32,7 @@ from trueflight.groundstation.identify.search import Search, State
 from trueflight.groundstation.identify.verdicts import (
     MISSING,
     NOT_EXCITED,
+    POSSIBLE,
     Scale,
     also_possible,
     by_weight,
@@ -189,6 +193,9 @@ def _verdicts(
     )
     named, absent = judge(search, found, here, scale, lambda name: seen_as(problem, name, here), doubt)
     named = with_ridges(named, ridges(entire, here, found.names))
+    named = [_perhaps_late(search, found, entire, here, v) for v in named]
+    both = with_shares([*named, *absent], shares(entire, here, found.names))
+    named, absent = both[: len(named)], both[len(named) :]
     candidates = {c.effect for c in problem.choices}
     others = [
         unmeasured(e, e.lacks(problem.flight))
@@ -208,6 +215,33 @@ def _verdicts(
         rank += verdict.rank is not None
         turning.append(replace(verdict, rank=None if verdict.rank is None else rank))
     return [*map(included, base.names()), *named, *by_weight(absent), *others, *turning], terms
+
+
+def _perhaps_late(
+    search: Search, found: State, entire: ForceProblem, here: Fit, verdict: EffectVerdict
+) -> EffectVerdict:
+    """A verdict on what delays the thrust, which a late estimate of the velocity may be instead."""
+    choice = next(c for c in found.choices if c.effect == verdict.name)
+    if entire.effects[verdict.name].stage is not Stage.COMMAND:
+        return verdict
+    rest = search.without(found, choice).choices
+    late = late_instead(entire, here, entire.fit(rest, None))
+    if late is None:
+        return verdict
+    # how it is smoothed is not known: the shape of the answer tells no more
+    others = tuple(
+        c.effect
+        for c in entire.choices
+        if entire.effects[c.effect].stage is Stage.COMMAND
+        and c.effect not in (*found.names, *verdict.indistinguishable_from)
+    )
+    told = "a late estimate" if math.isnan(late) else f"a velocity estimate {1e3 * late:.0f} ms late"
+    return replace(
+        verdict,
+        verdict=POSSIBLE,
+        indistinguishable_from=(*verdict.indistinguishable_from, *others, told),
+        advice="log an accelerometer, or fly quick steps to the sides as well: they tell it from a late estimate",
+    )
 
 
 def later(problem: ForceProblem, found: Sequence[str], here: Fit) -> float:

@@ -14,13 +14,18 @@ from scipy import special
 
 from trueflight.groundstation.identify.doubt import Weighing
 from trueflight.groundstation.identify.fitting import Fit, variance_per_independent_sample
-from trueflight.groundstation.identify.search import Search, State
+from trueflight.groundstation.identify.order import answers
+from trueflight.groundstation.identify.search import Choice, Search, State
 from trueflight.groundstation.results import EffectVerdict, ParameterEstimate
 from trueflight.models.effect import Effect
 
 MISSING, POSSIBLE, MINOR, NOT_SUPPORTED, NOT_EXCITED, INCLUDED = (
     "missing", "possible", "minor", "not_supported", "not_excited", "included",
 )  # fmt: skip
+
+
+ANSWERS = 0.25
+"""Confidence that is left of what comes after what it explains: in seeded hovers in gusts none of it was there."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,9 @@ def judge(
         weighed = None if doubt is None else doubt.of(effect.name)
         if doubt is not None and doubt.quiet and weighed is not None and weighed.steady:
             weighed = None
+        after = answers(search.problem, figures, effect.name) if scale.seen_in != "rotation" else None
         sure = not same and (weighed is None or weighed.holds) and _somewhere(figures, effect.name)
+        sure = sure and after is None
         found.append(
             EffectVerdict(
                 effect.name,
@@ -69,9 +76,10 @@ def judge(
                 (*same, *effect.aliases, *also(effect.name)),
                 _add(effect) if sure else _tell(same, effect),
                 scale.seen_in,
-                "" if weighed is None else weighed.told,
+                ("" if weighed is None else weighed.told) if after is None else _answered(after),
                 confidence=_there(search, current.fit, search.without(current, choice).fit)
-                * (1.0 if weighed is None else weighed.trust),
+                * (1.0 if weighed is None else weighed.trust)
+                * (1.0 if after is None else ANSWERS),
             )
         )
     # nobody grants the rotation the slow error that every acceleration has: what is small in it is sure of nothing
@@ -79,6 +87,13 @@ def judge(
     absent = dict.fromkeys(c.effect for c in search.problem.choices if c.effect not in current.names)
     stood_for = {n: [c.effect for c, same in rivals.items() if n in same] for n in absent}
     return found, [_absent(search, current, scale, n, stood_for[n], doubtful) for n in absent]
+
+
+def _answered(seconds: float) -> str:
+    return (
+        f"it comes {seconds:.2g} s after what it is to explain: the commands answer the motion there, as a controller "
+        "answers a gust; a flight that is led through the same tells"
+    )
 
 
 def _there(search: Search, with_: Fit, without: Fit) -> float:
@@ -105,11 +120,12 @@ def _absent(
     problem = search.problem
     effect, own = problem.effects[name], [c for c in problem.choices if c.effect == name]
     present, through = {*problem.included, *current.names}, None
+    carried: tuple[Choice, ...] = ()
     if effect.acts_through and not present & set(effect.acts_through):
         carriers = [c for n in effect.acts_through for c in problem.choices if c.effect == n]
         if not carriers:
             return unmeasured(effect, ())
-        through = carriers[0].effect
+        through, carried = carriers[0].effect, (carriers[0],)
         tried = [search.state((*current.choices, carriers[0], c)).fit for c in own]
     else:
         tried = [problem.beside(current.fit, c) or search.state((*current.choices, c)).fit for c in own]
@@ -131,7 +147,8 @@ def _absent(
         # as a stand-in for the effect found, not beside it
         whole_sets = [s.fit for s in search.near(current) if name in s.names and stands_for[0] not in s.names]
         swapped = whole_sets or [
-            search.state([c if n.effect == stands_for[0] else n for n in current.choices]).fit for c in own
+            search.state([x for n in current.choices for x in _in_place(n, stands_for[0], carried, c)]).fit
+            for c in own
         ]
         return verdict(POSSIBLE, min(swapped, key=lambda f: f.sse), stands_for, _tell(stands_for, effect))
     if not all(search.excited(current, c, through) for c in own):
@@ -142,6 +159,11 @@ def _absent(
     small = f"seen, but too small to matter here{scale.told(share)}"
     minor = seen and there > 0.5 and not doubtful
     return verdict(MINOR if minor else NOT_SUPPORTED, extended, (), small if seen else "")
+
+
+def _in_place(present: Choice, of: str, carried: tuple[Choice, ...], choice: Choice) -> tuple[Choice, ...]:
+    """What stands where `present` does, with `choice`, and what it acts through, in place of the effect `of`."""
+    return (*carried, choice) if present.effect == of else (present,)
 
 
 def by_weight(verdicts: Sequence[EffectVerdict]) -> list[EffectVerdict]:

@@ -19,6 +19,7 @@ from trueflight.models.frames import rotate_inverse
 from trueflight.models.model import rigid_body_model
 from trueflight.models.reference import trajectory_from_csv
 from trueflight.models.trajectory import Trajectory
+from trueflight.models.vehicle import GRAVITY
 from trueflight.sim_bridge.truth.hidden import Hidden, choose
 
 
@@ -144,3 +145,58 @@ def test_a_noisy_gyroscope_does_not_make_the_lever_arm_smaller() -> None:
         assert p.low < hidden.parameters[p.name] < p.high, p
     x = told.parameters[0]
     assert x.value == pytest.approx(hidden.parameters["x"], rel=0.04)  # 30 % less where the noise is left in
+
+
+def hover_in_gusts(seed: int) -> Flight:
+    """40 s of a hover that a controller holds by position and velocity against gusts of 0.3 m/s², nothing hidden."""
+    flight = simulated(3, "none")
+    rng, dt, n = np.random.default_rng(seed), 0.01, 4000
+    z = v = gust = 0.0
+    rows = []
+    for _ in range(n):
+        gust += -gust * dt / 1.0 + 0.3 * np.sqrt(2.0 * dt / 1.0) * rng.normal()
+        thrust = GRAVITY - 6.0 * z - 4.0 * v + 0.05 * rng.normal()
+        rows.append((z, v, thrust, thrust + gust))
+        v += (thrust + gust - GRAVITY) * dt
+        z += v * dt
+    height, climb, thrust, felt = np.array(rows).T
+    up = np.array([0.0, 0.0, 1.0])
+    noise = 0.08 * rng.normal(size=(n, 3))
+    return Flight(
+        name="hover",
+        vehicle=flight.vehicle,
+        t=dt * np.arange(n),
+        position=(1.5 + height)[:, None] * up,
+        velocity=climb[:, None] * up,
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        angular_velocity=0.002 * rng.normal(size=(n, 3)),
+        specific_force=felt[:, None] * up + noise,
+        thrust_command=thrust / GRAVITY * flight.vehicle.hover_thrust,
+    )
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_thrust_that_answers_gusts_is_not_taken_for_a_bent_curve(seed: int) -> None:
+    found = said_of(hover_in_gusts(seed))
+    assert found.named("missing") == ()
+    (first,) = (e for e in found.effects if e.rank == 1)
+    assert "after what it is to explain" in first.rests_on and (first.confidence or 0.0) < 0.5
+
+
+def test_a_bias_and_a_thrust_that_leans_are_told_as_one_where_thrust_hardly_varies(tmp_path) -> None:
+    low_and_slow = through(*[(0.1 * (k % 2), 0.0, 1.5) for k in range(12)])
+    fly(tmp_path / "still.mcap", ("accelerometer_bias", "thrust_misalignment"), 5, low_and_slow)
+    found = said_of(read_flight(tmp_path / "still.mcap"))
+    assert not {"accelerometer_bias", "thrust_misalignment"} & {*found.named("missing")}
+    told = {e.name: e for e in found.effects}
+    both = [told["accelerometer_bias"], told["thrust_misalignment"]]
+    assert all(e.verdict == "possible" for e in both), [e.verdict for e in both]
+
+
+def test_where_an_estimator_made_the_acceleration_a_delay_may_be_its_own() -> None:
+    flight = simulated(3, "motor_lag")
+    assert "motor_lag" in said_of(flight).named("missing")
+    (told,) = (e for e in said_of(replace(flight, accelerometer=False)).effects if e.name == "motor_lag")
+    assert told.verdict == "possible" and "a late estimate" in told.indistinguishable_from
+    from_velocity = replace(flight, specific_force=None)
+    assert "motor_lag" in said_of(from_velocity).named("missing")
