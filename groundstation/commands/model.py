@@ -17,7 +17,9 @@ from trueflight.groundstation.commands.options import (
     JsonOption,
     MappingOption,
     ModelOption,
+    PerFlightOption,
     SaveOption,
+    SharedOption,
     StoreOption,
     VehicleOption,
 )
@@ -41,7 +43,12 @@ def register(app: typer.Typer) -> None:
 @model_app.command("add")
 def model_add(
     effect: Annotated[str, typer.Argument(help="Name of the effect: groundstation effects")],
-    flight: Annotated[Path, typer.Option("--flight", help="The flight to fit to.")],
+    flight: Annotated[
+        list[Path],
+        typer.Option(
+            "--flight", help="The flight to fit to. Repeat for several of one vehicle, oldest first."
+        ),
+    ],
     validate: Annotated[
         Path | None, typer.Option("--validate", help="Another flight, to see the error fall on.")
     ] = None,
@@ -51,28 +58,34 @@ def model_add(
     store: StoreOption = DEFAULT_STORE,
     effects: EffectsOption = None,
     bandwidth: BandwidthOption = None,
+    per_flight: PerFlightOption = None,
+    shared: SharedOption = None,
     save: SaveOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Add an effect: refit, write a new model version, and show the error falling.
 
+    From several flights it takes what is the vehicle's; what is each flight's own is fitted beside and left out.
+
     Example: groundstation model add rotor_drag --flight identify.csv --validate validate.csv
     """
     from trueflight.groundstation.evaluate.compare import compare, waterfall
     from trueflight.groundstation.output import as_json as tables_json
+    from trueflight.groundstation.output.several_tables import print_left_out
     from trueflight.groundstation.output.tables import print_waterfall
-    from trueflight.groundstation.reading import read_flight
-    from trueflight.groundstation.reading.several import read_held_out
+    from trueflight.groundstation.reading.several import read_held_out, read_together
     from trueflight.groundstation.versions.choice import choose_model
-    from trueflight.groundstation.versions.store import add_effect, lineage
+    from trueflight.groundstation.versions.several import add_effect_to
+    from trueflight.groundstation.versions.store import lineage
     from trueflight.groundstation.versions.store import save as save_version
 
-    read = read_flight(flight, vehicle, mapping)
+    flights = read_together(flight, vehicle, mapping)
+    read = flights[-1]
     held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
     base = choose_model(read, model, store, effects)
     with working(console, f"fitting {effect}", as_json):
-        made = add_effect(base, effect, [read], bandwidth)
-    made, path = save_version(store, made, base if base.version else None)
+        told = add_effect_to(base, effect, flights, bandwidth, per_flight or (), shared or ())
+    made, path = save_version(store, told.model, base if base.version else None)
     line = lineage(store, made)
     steps = waterfall(read, held_out, line, bandwidth)
     if save is not None:
@@ -87,6 +100,7 @@ def model_add(
                 **tables_json.model_table(made),
                 "path": str(path),
                 "network_dropped": base.network is not None,
+                **tables_json.left_out_table(told.left_out, told.differing),
                 "waterfall": tables_json.waterfall_table(steps),
                 "recording": None if save is None else str(save),
             }
@@ -94,6 +108,7 @@ def model_add(
         return
     print_waterfall(console, steps, read.name, None if held_out is None else held_out.name)
     _print_added(made, base, effect)
+    print_left_out(console, told.left_out, told.differing)
     console.print(f"model version: {path}")
     print_written(console, save)
 

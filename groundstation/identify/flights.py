@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from trueflight.groundstation.identify.ownership import ownership
+from trueflight.groundstation.identify.ownership import needs_several, ownership
 from trueflight.groundstation.identify.together import check_together, diagnose_together
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.results import Diagnosis
@@ -36,7 +36,5 @@ def diagnose_flights(
         if validation is not None:
             check_together([*flights, validation])
         return diagnose_together(flights, base, validation, bandwidth, whose, progress)
-    if per_flight or shared:
-        option = "--per-flight" if per_flight else "--shared"
-        raise InputError(f"{option} goes with several flights of one vehicle; give more than one")
+    needs_several(per_flight, shared)
     return diagnose(flights[0], base, validation, bandwidth, progress, healthy)

@@ -5,7 +5,7 @@ An effect's file says it (`Parameter.belongs_to`); who flies may know better and
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from trueflight.models.effect import FLIGHT, VEHICLE, Effect
@@ -65,6 +65,13 @@ def ownership(
     if both := sorted(own & common):
         raise InputError(f"{'.'.join(both[0])} is named by --per-flight and by --shared; leave out one")
     return Ownership(own, common)
+
+
+def needs_several(per_flight: Sequence[str], shared: Sequence[str]) -> None:
+    """Raise `InputError` where numbers are given owners though there is one flight only."""
+    if per_flight or shared:
+        option = "--per-flight" if per_flight else "--shared"
+        raise InputError(f"{option} goes with several flights of one vehicle; give more than one")
 
 
 def _numbers(name: str, option: str, effects_directory: str | None) -> list[Number]:

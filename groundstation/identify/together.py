@@ -435,7 +435,7 @@ def _together(each: Sequence[Unexplained], names: Sequence[str]) -> Unexplained:
     """What is left of all flights: that of the one with the most, told of each."""
     worst = max(each, key=lambda u: (u.verdict, u.variance_share))
     where = tuple(
-        f"{name}: {text}" for name, one in zip(names, each, strict=True) if one.verdict for text in one.where
+        f"{name}: {one.where[0]}" for name, one in zip(names, each, strict=True) if one.verdict and one.where
     )
     misfit = tuple(m for one in each for m in one.misfit)
     return replace(worst, where=where or worst.where, misfit=misfit)

@@ -12,7 +12,8 @@ from trueflight.groundstation.library.models import Model, as_model
 from trueflight.groundstation.library.questions import Which
 from trueflight.groundstation.library.shown import Summary
 from trueflight.groundstation.versions.choice import check_vehicle, choose_model
-from trueflight.groundstation.versions.store import DEFAULT_STORE, add_effect
+from trueflight.groundstation.versions.several import add_effect_to
+from trueflight.groundstation.versions.store import DEFAULT_STORE
 from trueflight.models import flight as columns
 from trueflight.models import model as versions
 from trueflight.models.design import Design, save_design
@@ -76,6 +77,8 @@ def add(
 ) -> Model:
     """A model with one `effect` more, every parameter fitted anew to the `flight` (or several); not saved.
 
+    Of several flights, in the order of time, it has what is the vehicle's; what is each flight's own is left out.
+
     `model`, `bandwidth` (Hz), `store` and `effects` as for `compare`. `Model.save` writes it as a version. Parameters
     have the units that `effects()` tells. A network of the model is dropped: it was trained without this effect.
 
@@ -84,7 +87,7 @@ def add(
     """
     flights = [flight] if isinstance(flight, columns.Flight) else list(flight)
     base = choose_model(_first(flights), model, store, effects)
-    return as_model(add_effect(base, effect, flights, bandwidth))
+    return as_model(add_effect_to(base, effect, flights, bandwidth).model)
 
 
 def train(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -162,6 +162,20 @@ def shared_table(n: SharedNumber) -> dict[str, Any]:
         "common": None if n.common is None else interval_table(n.common),
         "values": {v.flight: interval_table(v) for v in n.values},
     }
+
+
+def left_out_table(
+    left_out: Mapping[str, Sequence[ParameterEstimate]], differing: Sequence[SharedNumber]
+) -> dict[str, Any]:
+    """The JSON of what a model of the vehicle did not take from several flights."""
+    own = {
+        effect: {
+            name: {p.name: interval_table(p) for p in numbers if p.flight == name}
+            for name in dict.fromkeys(p.flight for p in numbers)
+        }
+        for effect, numbers in left_out.items()
+    }
+    return plain({"set_aside": own, "differing": [shared_table(n) for n in differing]})
 
 
 def fleet_table(fleet: Fleet) -> dict[str, Any]:

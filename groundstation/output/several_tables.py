@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -39,6 +41,27 @@ def print_several(console: Console, d: Diagnosis) -> None:
     if d.set_aside:
         console.print(
             f"[dim]Each flight's own, and no part of the vehicle's model:[/dim] {', '.join(d.set_aside)}",
+            highlight=False,
+        )
+
+
+def print_left_out(
+    console: Console,
+    left_out: Mapping[str, Sequence[ParameterEstimate]],
+    differing: Sequence[SharedNumber],
+) -> None:
+    """What a model of the vehicle did not take from several flights."""
+    for effect, numbers in left_out.items():
+        own = "; ".join(f"{p.flight} {told(p)}" for p in numbers)
+        console.print(
+            f"left out, for it is each flight's own: {effect} ({escape(own)})",
+            style="yellow",
+            highlight=False,
+        )
+    for number in differing:
+        console.print(
+            f"{escape(difference(number))}; the version has it as in the last flight",
+            style="yellow",
             highlight=False,
         )
 

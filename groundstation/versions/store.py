@@ -106,6 +106,11 @@ def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: f
     Raises `InputError` for an effect that is there already, acts only through one that is not, or needs columns that
     a flight lacks.
     """
+    return refit(extended(base, effect, flights), flights, bandwidth)
+
+
+def extended(base: Model, effect: str, flights: Sequence[Flight]) -> Model:
+    """`base` with one more effect at "no effect", without its network. Raises `InputError` as `add_effect`."""
     known = effect_named(effect, base.effects_directory)
     if effect in base.names():
         raise InputError(f"{effect} is in {base.label} already; 'model refit' fits its parameters anew")
@@ -125,11 +130,10 @@ def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: f
         if base.rotates_exactly or known.exact_rotation
         else (Term(EXACT_ROTATION.name, {}), *base.terms)
     )
-    made = base.with_network(None).with_terms((*terms, Term(effect, known.neutral(base.vehicle))))
-    return refit(made, flights, bandwidth)
+    return base.with_network(None).with_terms((*terms, Term(effect, known.neutral(base.vehicle))))
 
 
-def _turned(term: Term, model: Model, flights: Sequence[Flight]) -> Term:
+def turned(term: Term, model: Model, flights: Sequence[Flight]) -> Term:
     """The term, fitted to the rotation of the first flight that tells, where its effect is a rotational one."""
     effect = effect_named(term.effect, model.effects_directory)
     if not effect.rotational:
@@ -146,7 +150,7 @@ def refit(model: Model, flights: Sequence[Flight], bandwidth: float | None = Non
     problem = MeasuredFlights(
         tuple(measure(f, bandwidth) for f in flights), model.effects_directory, model.network_chain()
     )
-    model = model.with_terms(tuple(_turned(t, model, flights) for t in model.terms))
+    model = model.with_terms(tuple(turned(t, model, flights) for t in model.terms))
     fitted = fit(problem, model.terms)
     rms = float((fitted.sse / fitted.residual.size) ** 0.5)
     hashes = "+".join(f.data_hash for f in flights)

@@ -213,3 +213,19 @@ def test_the_report_and_the_library_show_all_flights(tmp_path: Path) -> None:
     told = str(d.summary())
     assert "2 flights of quad5" in told and "The same in all flights: rotor_drag x, rotor_drag y" in told
     assert "no part of the vehicle's model: wind" in told.replace("\n", " ")
+
+
+def test_a_models_version_takes_what_is_the_vehicles_and_says_what_it_left_out(tmp_path: Path) -> None:
+    store = ["--store", str(tmp_path / "store")]
+    flights = [word for seed in (3, 1) for word in ("--flight", flown(seed).origin)]
+    done = programs.run("groundstation", "model", "add", "rotor_drag", *flights, *store, "--json")
+    assert done.returncode == 0, done.stderr
+    made = valid("groundstation model add", json.loads(done.stdout))
+    (drag,) = [e for e in made["effects"] if e["parameters"]]
+    assert drag["parameters"]["x"] == pytest.approx(DRAG, rel=0.02)
+    # the wind that was fitted beside it, in the flight that had one
+    assert made["set_aside"]["wind"]["flight-1"]["x"]["value"] == pytest.approx(WINDS[1][0], abs=0.1)
+    assert made["differing"] == []
+    done = programs.run("groundstation", "model", "add", "wind", *flights, *store)
+    assert done.returncode == 2
+    assert "wind is each flight's own, and no part of a vehicle's model" in done.stderr
