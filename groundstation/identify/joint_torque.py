@@ -63,6 +63,11 @@ class JointTorque:
         return (*shared, *(replace(c, spans=self.each) for c in shared if self.apart))
 
     @property
+    def axes(self) -> int:
+        """Axes that are measured."""
+        return len(self.measurements[0].axes)
+
+    @property
     def settled(self) -> tuple[Choice, ...]:
         """None: nothing else tells of the torque."""
         return ()
@@ -83,7 +88,7 @@ class JointTorque:
 
     @cached_property
     def weight(self) -> np.ndarray:
-        """Of each used sample and axis (K, 3), s²/rad: as each flight alone has it."""
+        """Of each used sample and axis (K, A), s²/rad: as each flight alone has it."""
         return np.concatenate([np.tile(p.weight, (len(p.blocks), 1)) for p in self.flights])
 
     @cached_property
@@ -116,7 +121,7 @@ class JointTorque:
         before = np.cumsum([0, *(len(n) for n in names)])
         x = np.zeros(before[-1] + len(own))
         for start in before[:-1]:
-            x[start : start + 3] = 1.0  # the gains of the control torque
+            x[start : start + self.axes] = 1.0  # the gains of the control torque
         for _ in range(ROUNDS):
             jacobian, residual = self._linearised(x, own, before)
             flat = jacobian.reshape(residual.size, -1)
@@ -148,14 +153,14 @@ class JointTorque:
     def _linearised(
         self, x: np.ndarray, own: Sequence[tuple[str, Parameter, Span]], before: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivative of the weighted prediction (K, 3, F + P) and residual (K, 3) at `x`."""
-        fixed = int(before[-1])
-        jacobian = np.zeros((len(self.blocks), 3, len(x)))
-        residual = np.empty((len(self.blocks), 3))
+        """Derivative of the weighted prediction (K, A, F + P) and residual (K, A) at `x`."""
+        fixed, axes = int(before[-1]), self.axes
+        jacobian = np.zeros((len(self.blocks), axes, len(x)))
+        residual = np.empty((len(self.blocks), axes))
         for k, (p, rows) in enumerate(zip(self.flights, self.rows, strict=True)):
             mine = slice(int(before[k]), int(before[k + 1]))
             linear = np.stack([c for _, c in p.turning.nuisances], axis=2) * p.weight[None, :, None]
-            gains = x[mine][:3]
+            gains = x[mine][:axes]
             part = jacobian[rows]
             part[:, :, mine] = linear
             predicted = linear @ x[mine]
@@ -166,7 +171,7 @@ class JointTorque:
                 part[:, :, fixed + i] = shape * gains
                 value = x[fixed + i]
                 predicted = predicted + value * shape * gains
-                for axis in range(3):  # an effect's torque, too, goes through the axis' gain
+                for axis in range(axes):  # an effect's torque, too, goes through the axis' gain
                     part[:, axis, mine.start + axis] += value * shape[:, axis]
             residual[rows] = p.turning.measured * p.weight - predicted
         return jacobian, residual
@@ -192,10 +197,10 @@ class JointTorque:
         return replace(fitted, terms=tuple(terms), spanned=spanned)
 
     def contribution(self, here: Fit, choice: Choice, through: str | None = None) -> np.ndarray:
-        """What the choice at its typical size adds to the weighted angular acceleration, (3 K, P)."""
+        """What the choice at its typical size adds to the weighted angular acceleration, (K A, P)."""
         columns = []
         for name, parameter, span in self._own([choice]):
-            column = np.zeros((len(self.blocks), 3))
+            column = np.zeros((len(self.blocks), self.axes))
             for k, (p, rows) in enumerate(zip(self.flights, self.rows, strict=True)):
                 if span.flight in (None, k):
                     column[rows] = parameter.typical * p.column(name, parameter) * p.weight
@@ -240,18 +245,13 @@ class JointTorque:
 
     @property
     def noise(self) -> np.ndarray:
-        """Weighted noise of each axis (3,), RMS over the flights."""
-        return np.asarray(
-            np.sqrt(np.mean([(p.turning.rotation.noise * p.weight) ** 2 for p in self.flights], axis=0))
-        )
+        """Weighted noise of each axis (A,), RMS over the flights."""
+        return np.asarray(np.sqrt(np.mean([(_noise(p) * p.weight) ** 2 for p in self.flights], axis=0)))
 
     def only_noise(self, here: Fit) -> bool:
         """Whether no axis of any flight has much more left than its noise."""
         return all(
-            np.all(
-                np.sqrt(np.mean((here.residual[rows] / p.weight) ** 2, axis=0))
-                < ABOVE * p.turning.rotation.noise
-            )
+            np.all(np.sqrt(np.mean((here.residual[rows] / p.weight) ** 2, axis=0)) < ABOVE * _noise(p))
             for p, rows in zip(self.flights, self.rows, strict=True)
         )
 
@@ -259,13 +259,18 @@ class JointTorque:
         """Residual of the rotors' torque alone, and of what was found, rad/s² over all axes and flights."""
         was, left = (float(np.sqrt(np.mean((f.residual / self.weight) ** 2))) for f in (before, after))
         rotations = self.measurements
-        noise = float(np.sqrt(np.mean([np.mean(r.noise**2) for r in rotations])))
-        return RotationalRms(was, left, noise, min(r.bandwidth for r in rotations))
+        noise = float(np.sqrt(np.mean([np.mean(_noise(p) ** 2) for p in self.flights])))
+        return RotationalRms(was, left, noise, min(r.bandwidth for r in rotations), rotations[0].source)
 
 
 def one_choice_each(choices: Sequence[Choice]) -> tuple[Choice, ...]:
     """The candidates without numbers of their own for each flight."""
     return tuple(dict.fromkeys(replace(c, spans=()) for c in choices))
+
+
+def _noise(problem: TorqueProblem) -> np.ndarray:
+    rotation = problem.turning.rotation
+    return rotation.noise[list(rotation.axes)]
 
 
 def _nuisance(name: str) -> Parameter:

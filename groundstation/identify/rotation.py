@@ -50,7 +50,7 @@ def judge_rotation(
     effects = {
         n: e for n, e in catalogue(effects_directory).items() if e.rotational and e.stage is not Stage.RATE
     }
-    turns = _that_turns(flight)
+    turns = that_turns(flight)
     missing = {n: e.lacks(turns) for n, e in effects.items() if n not in included}
     measurable = tuple(n for n, columns in missing.items() if not columns)
     turning = turning_of(flight) if measurable else None
@@ -74,7 +74,7 @@ def judge_rotation(
     return RotationalFindings(verdicts, tuple(t for t in found.fit.terms if t.effect in kept), rms, shares)
 
 
-def _that_turns(flight: Flight) -> Flight:
+def that_turns(flight: Flight) -> Flight:
     """The flight with the body rates of its attitude where it has no others."""
     rotation = measure_rotation(flight) if flight.angular_velocity is None else None
     return flight if rotation is None else rotation.flight

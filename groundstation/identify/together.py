@@ -25,7 +25,9 @@ from trueflight.groundstation.identify.ownership import BY_FILE, Ownership
 from trueflight.groundstation.identify.rates import judge_rates
 from trueflight.groundstation.identify.remainder import unexplained
 from trueflight.groundstation.identify.ridges import ridges, with_ridges
+from trueflight.groundstation.identify.rotation import that_turns
 from trueflight.groundstation.identify.rotors import has_rotor_speeds
+from trueflight.groundstation.identify.rotors_apart import doubted
 from trueflight.groundstation.identify.search import Choice, Search, State
 from trueflight.groundstation.identify.spans import Piecewise
 from trueflight.groundstation.identify.torque import TorqueProblem, turning_of
@@ -233,11 +235,13 @@ class _Joint:
             for n, e in catalogue(base.effects_directory).items()
             if e.rotational and e.stage is not Stage.RATE
         }
-        missing = {n: e.lacks(self.all[0]) for n, e in effects.items() if n not in base.names()}
+        turns = that_turns(self.all[0])
+        missing = {n: e.lacks(turns) for n, e in effects.items() if n not in base.names()}
         measurable = tuple(n for n, columns in missing.items() if not columns)
         turnings = [turning_of(f) for f in self._within(FITTED)] if measurable else []
         told = [t for t in turnings if t is not None]
-        if not told or len(told) < len(self.all):
+        same = len({t.rotation.axes for t in told}) == 1
+        if not same or len(told) < len(self.all):
             nothing = tuple(unmeasured(effects[n], c) for n, c in missing.items())
             return _Rotation(nothing, (), None, ())
         already = tuple(n for n in effects if n in base.names())
@@ -260,6 +264,7 @@ class _Joint:
         scale = Scale(before.fit.sse, lambda share: "", "rotation")
         doubt = Weighing(problem, found.fit, problem.noise, quiet=problem.only_noise(found.fit))
         named, absent = judge(search, found, found.fit, scale, doubt=doubt)
+        named = [doubted(v, alone[-1], found.fit, quiet=True) for v in named]
         others = [unmeasured(effects[n], c) for n, c in missing.items() if n not in measurable]
         # a chain takes numbers that differ between flights as it takes plain ones
         values = cast("dict[str, dict[str, float]]", found.fit.values)
