@@ -215,6 +215,97 @@ class ParameterEstimate:
 
 
 @dataclass(frozen=True)
+class Change:
+    """A moment at which an effect changes, with its 95 % interval, s on the flight's clock."""
+
+    time: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What an effect is from `start` to `stop`, s on the flight's clock; where it is `absent` its parameters are those
+    without effect."""
+
+    start: float
+    stop: float
+    parameters: tuple[ParameterEstimate, ...]
+    absent: bool = False
+
+
+@dataclass(frozen=True)
+class DriftingParameter:
+    """A parameter that changes by and by: `value` (B,) at `times` (B,) s, and its 95 % interval, `low` to `high`."""
+
+    name: str
+    unit: str
+    times: np.ndarray
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+@dataclass(frozen=True)
+class OverTime:
+    """An effect that is not of one size throughout the flight: `stretches` between `changes`, or parameters that
+    `drift`."""
+
+    stretches: tuple[Stretch, ...] = ()
+    changes: tuple[Change, ...] = ()
+    drift: tuple[DriftingParameter, ...] = ()
+
+    @property
+    def ended(self) -> bool:
+        """Whether there is none of it at the end of the flight."""
+        return bool(self.stretches) and self.stretches[-1].absent
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """One line a parameter: what it is until when."""
+        told = [
+            f"{d.name} drifts: {_known(d.value[0], d.low[0], d.high[0])} {_unit(d.unit)}at {d.times[0]:.0f} s, "
+            f"{_known(d.value[-1], d.low[-1], d.high[-1])} at {d.times[-1]:.0f} s"
+            for d in self.drift
+        ]
+        names = dict.fromkeys(p.name for s in self.stretches for p in s.parameters)
+        return (*told, *(f"{name} = {self._in_stretches(name)}" for name in names))
+
+    def _in_stretches(self, name: str) -> str:
+        told = []
+        for k, stretch in enumerate(self.stretches):
+            p = next((p for p in stretch.parameters if p.name == name), None)
+            if stretch.absent:
+                what = "none" if p is None or p.value == 0.0 else f"{p.value:.3g} {_unit(p.unit)}as believed"
+            else:
+                what = "unseen" if p is None else f"{_known(p.value, p.low, p.high)} {_unit(p.unit)}".strip()
+            if k < len(self.changes):
+                c = self.changes[k]
+                told.append(f"{what.strip()} until {c.time:.2f} s [{c.low:.2f}, {c.high:.2f}]")
+            else:
+                told.append(f"{what.strip()} after")
+        return ", ".join(told)
+
+
+def _known(value: float, low: float, high: float) -> str:
+    return f"{value:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f"{unit} "
+
+
+@dataclass(frozen=True)
+class Gusts:
+    """Air that moves by itself: `acceleration` in m/s², RMS of each horizontal axis of the world, and `time_constant`
+    in s, each with its 95 % interval; `speed` in m/s through the drag that was found, None where none was."""
+
+    acceleration: ParameterEstimate
+    time_constant: ParameterEstimate
+    speed: float | None = None
+
+
+@dataclass(frozen=True)
 class EffectVerdict:
     """What the flight says about one effect of the catalogue.
 
@@ -222,7 +313,9 @@ class EffectVerdict:
     of the squared error before that the effect takes away, given the others; `p_value` robust to autocorrelation.
     `rests_on` tells what the verdict stands on where more is left than noise. `undetermined` are parameters that
     this flight does not determine, `products` what it determines of them instead; `confidence` the probability that
-    the verdict is right (of a possible effect that it or one it names is there), None where none is known.
+    the verdict is right (of a possible effect that it or one it names is there), None where none is known. `over_time`
+    tells how it changes in flight, None where it is of one size; `parameters` are then those of the end, or of the last
+    stretch in which there was any of it.
     `seen_in` is "acceleration" or "rotation": shares and ranks are each among their own.
     """
 
@@ -239,6 +332,7 @@ class EffectVerdict:
     undetermined: tuple[str, ...] = ()
     products: tuple[ParameterEstimate, ...] = ()
     confidence: float | None = None
+    over_time: OverTime | None = None
 
 
 @dataclass(frozen=True)
@@ -367,8 +461,9 @@ class Diagnosis:
     command acts, s, None where no clock was fitted. `unexplained` tells whether predictable structure is left;
     `left_out` the share of the samples that did not count, by reason. `rotational` is the residual of the angular
     acceleration, None where it was not seen; `shares` is what each rotor carries, None where it was not logged;
-    `alternatives` are other sets of effects that explain the flight nearly as
-    well as those found.
+    `alternatives` are other sets of effects that explain the flight nearly as well as those found. Of what changes in
+    flight, `model` keeps what holds at its end. `gusts` are what is left of the air's own motion, None where none are
+    seen.
 
     Of several flights fitted together, `flights` tells what each adds (empty for one), and `flight` is the last of
     them; `shared` asks of each number of the vehicle whether it is the same in all; `model` has what is the vehicle's,
@@ -393,6 +488,7 @@ class Diagnosis:
     rotational: RotationalRms | None = None
     alternatives: tuple[tuple[str, ...], ...] = ()
     shares: MotorShares | None = None
+    gusts: Gusts | None = None
     flights: tuple[OneFlight, ...] = ()
     shared: tuple[SharedNumber, ...] = ()
     set_aside: tuple[str, ...] = ()

@@ -94,12 +94,14 @@ class FreeParameter:
 class MeasuredFlights:
     """Measured flights and, for each, the motion that effects act on.
 
-    `always` acts in every prediction and is never fitted: the network of a model.
+    `always` acts in every prediction and is never fitted: the network of a model. So does `known` (K, A), m/s², behind
+    the filters: what changes in flight by and by.
     """
 
     measurements: tuple[Measurement, ...]
     effects_directory: str | None = None
     always: Chain = ()
+    known: np.ndarray | None = None
 
     @property
     def vehicle(self) -> Vehicle:
@@ -142,7 +144,8 @@ class MeasuredFlights:
                     continue
                 pieces = [piece(flight, key)[rows] for key, rows in zip(keys, cuts, strict=True)]
                 parts.append(self.behind_filter(m, np.concatenate(pieces)))
-            return np.concatenate(parts)
+            all_of_it = np.concatenate(parts)
+            return all_of_it if self.known is None else all_of_it + self.known
 
         return predicted
 
@@ -312,13 +315,15 @@ def fit(
     tolerance: float = 1e-6,
     pinned: Mapping[tuple[str, str, Span], float] | None = None,
     spans: Mapping[tuple[str, str], tuple[Span, ...]] | None = None,
+    given: Mapping[str, Values] | None = None,
 ) -> Fit:
     """Fit the parameters of `terms` (all of them, or the effects named in `refit`) to the flights.
 
     With `clock`, the delay between the columns is free within one sample of what the vehicle file says: no log's
     clock is better than that, and a shift must not be taken for drag. Each parameter that `spans` names, by effect and
     parameter, is fitted once for each of its spans; outside of them it is without effect. `pinned` holds numbers, by
-    effect, parameter and span, where they are.
+    effect, parameter and span, where they are; `given` are numbers by effect that are not fitted and differ between
+    spans.
     """
     effects = {t.effect: effect_named(t.effect, problem.effects_directory) for t in terms}
     fixed = {t.effect: dict(t.values) for t in terms}
@@ -348,7 +353,9 @@ def fit(
 
     def all_values(x: np.ndarray) -> dict[str, dict[str, Value]]:
         fitted = {**pinned, **{f.number: float(value) for f, value in zip(free, x, strict=True)}}
-        values: dict[str, dict[str, Value]] = {name: dict(fixed.get(name, {})) for name in effects}
+        values: dict[str, dict[str, Value]] = {
+            name: {**fixed.get(name, {}), **(given or {}).get(name, {})} for name in effects
+        }
         for (name, parameter), neutral in neutral_of.items():
             parts = [(n[2], fitted[n]) for n in numbers if n[:2] == (name, parameter)]
             values[name][parameter] = number(parts, neutral)
@@ -378,7 +385,7 @@ def fit(
         Term(name, last[name], intervals[name] or (terms[i].intervals if i < len(terms) else {}))
         for i, name in enumerate(effects)
     )
-    spanned = all_values(estimate) if any(n[2] != EVERYWHERE for n in numbers) else {}
+    spanned = all_values(estimate) if given or any(n[2] != EVERYWHERE for n in numbers) else {}
     return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a), spanned)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,7 +17,7 @@ from trueflight.groundstation.identify.fitting import (
     with_clock,
 )
 from trueflight.groundstation.identify.search import Choice, State, evidence, sizes, whole
-from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Values, number
+from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Values, held, moments_of, number
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.models.effect import Effect, Parameter, Stage
 from trueflight.models.effects import catalogue
@@ -36,6 +36,7 @@ class ForceProblem:
     """The specific force of `flights` against a model and more effects: the `Problem` of a search.
 
     `turning` are the effects found in the rotation: they act on the thrust, too, and are not fitted to it once more.
+    Those of them that change in flight have the values `turning_in_time`.
     `on_the_way` are those that rotor speeds have shown to act before the rotors, `beside_all` those fitted in every
     state without being judged, `only` tells which effects are looked for.
     """
@@ -46,6 +47,7 @@ class ForceProblem:
     turning: tuple[Term, ...] = ()
     on_the_way: tuple[Term, ...] = ()
     beside_all: tuple[str, ...] = ()
+    turning_in_time: Mapping[str, Values] = field(default_factory=dict)
     only: Callable[[Effect], bool] = lambda _: True
 
     @cached_property
@@ -120,10 +122,11 @@ class ForceProblem:
         terms = [*self.base.terms, *self.turning, *(Term(n, start.get(n, {})) for n in free)]
         terms = self._placed(terms, added)
         spans = self._spans(choices)
-        fitted = fit(self.flights, terms, refit=free, spans=spans)
+        given = self.turning_in_time
+        fitted = fit(self.flights, terms, refit=free, spans=spans, given=given)
         if through := [n for n in added if self.effects[n].acts_through]:
             # what acts through another can balance it far from the best fit: begin once more from "none of it"
-            other = fit(self.flights, self._anew(terms, through), refit=free, spans=spans)
+            other = fit(self.flights, self._anew(terms, through), refit=free, spans=spans, given=given)
             fitted = other if evidence(self, other, fitted) > 0.0 else fitted
         return fitted
 
@@ -299,12 +302,19 @@ class ForceProblem:
         """Squared error on the held-out flight, (m/s²)²."""
         if self.held_out is None:
             return None
-        chain = [(self.effects[t.effect], t.values) for t in fitted.terms]  # as it was at the end
-        return float(np.sum((self.held_out.measured() - self.held_out.predict(chain)) ** 2))
+        # as the vehicle was at one time of the flight: which, nobody tells
+        moments = {t for f in fitted.free for t in (f.span.start, f.span.stop) if np.isfinite(t)}
+        moments |= {t for v in self.turning_in_time.values() for t in moments_of(v)}
+        measured, errors = self.held_out.measured(), []
+        for start in (-np.inf, *sorted(moments)):
+            chain = [(self.effects[n], held(v, 0, start)) for n, v in fitted.values.items()]
+            errors.append(float(np.sum((measured - self.held_out.predict(chain)) ** 2)))
+        return min(errors)
 
 
 def mean_square_before(flights: MeasuredFlights, base: Model) -> float:
     """Mean squared error of the base model as it stands, nothing refitted but the clock, nothing learnt acting."""
+    flights = replace(flights, known=None)
     chain = with_clock(flights.measurements[0], base.chain())
     alone = [(effect, values) for effect, values in chain if effect.stage is not Stage.REMAINDER]
     return float(np.mean((flights.measured() - flights.predict(alone)) ** 2))

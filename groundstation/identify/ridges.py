@@ -49,7 +49,8 @@ def ridges(problem: ForceProblem, here: Fit, found: Sequence[str]) -> tuple[Ridg
     several = len(problem.flights.measurements) > 1
     for name in found:
         carriers = [n for n in problem.effects[name].acts_through if here.of(n)]
-        for i in here.sizes(name):
+        # of what changes in flight, the last
+        for i in {here.free[i].parameter.name: i for i in here.sizes(name)}.values():
             others = [j for n in carriers for j in here.sizes(n)]
             if not others or _sharp(here, i) or not np.any(here.jacobian[:, :, i]):
                 continue
@@ -151,7 +152,14 @@ def _cost(problem: ForceProblem, here: Fit, i: int, at: float, unit: float) -> f
     terms = [t for t in here.terms if t.effect not in nuisance]
     free = here.free[i]
     fitted = tuple({f.effect for f in here.free if not f.nuisance})
-    held = fit(problem.flights, terms, refit=fitted, pinned={free.number: at}, spans=problem.spans_of(here))
+    held = fit(
+        problem.flights,
+        terms,
+        refit=fitted,
+        pinned={free.number: at},
+        spans=problem.spans_of(here),
+        given=problem.turning_in_time,
+    )
     return max((held.sse - here.sse) / unit, 0.0)
 
 

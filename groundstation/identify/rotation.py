@@ -6,17 +6,19 @@ given all others, on held-out blocks, with inference that holds under autocorrel
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from trueflight.groundstation.identify.actuation import fit_rate_loop
 from trueflight.groundstation.identify.adequacy import ABOVE
+from trueflight.groundstation.identify.changes import in_time, in_words, over_time
 from trueflight.groundstation.identify.doubt import Weighing
 from trueflight.groundstation.identify.rotors_apart import doubted
 from trueflight.groundstation.identify.search import Search
 from trueflight.groundstation.identify.shares import judge_shares, motor_shares
+from trueflight.groundstation.identify.spans import Values
 from trueflight.groundstation.identify.torque import TorqueProblem, turning_of
 from trueflight.groundstation.identify.verdicts import Scale, by_weight, judge, unmeasured
 from trueflight.groundstation.measured.measurement import measure_rotation
@@ -30,12 +32,13 @@ from trueflight.models.model import Term
 @dataclass(frozen=True)
 class RotationalFindings:
     """What the rotation of a flight says: verdicts, the terms found, and the residual and what each rotor carries where
-    rotors were recorded."""
+    rotors were recorded; `spanned` are the values of those terms that change in flight."""
 
     verdicts: tuple[EffectVerdict, ...]
     terms: tuple[Term, ...]
     rms: RotationalRms | None
     shares: MotorShares | None = None
+    spanned: Mapping[str, Values] = field(default_factory=dict)
 
 
 def judge_rotation(
@@ -59,7 +62,13 @@ def judge_rotation(
         return RotationalFindings(unseen, (), None, shares)
     problem = TorqueProblem(turning, effects, measurable, tuple(n for n in effects if n in included))
     search = Search(problem)
-    before, found = search.state(()), search.select()
+    found = in_time(search, search.select(), drifts=False).state
+    if any(c.spans for c in found.choices):
+        # what is left of each axis is known only now
+        problem = replace(problem, weighed_with=found.choices)
+        search = Search(problem)
+        found = search.grown(search.state(found.choices))
+    before = search.state(())
     scale = Scale(before.fit.sse, lambda share: "", "rotation")
     r = problem.turning.rotation
     left, noise = found.fit.residual / problem.weight, r.noise[list(r.axes)]
@@ -69,9 +78,12 @@ def judge_rotation(
     named, absent = ([doubted(v, problem, found.fit, noise_alone) for v in x] for x in (named, absent))
     others = [unmeasured(effects[n], c) for n, c in missing.items() if n not in measurable]
     rms = problem.rms(before.fit, found.fit)
+    named = in_words(named, {c.effect: t for c in found.choices if (t := over_time(problem, found.fit, c))})
     verdicts = judge_shares(shares, [*named, *by_weight(absent), *others])
     kept = {v.name for v in verdicts if v.rank is not None}
-    return RotationalFindings(verdicts, tuple(t for t in found.fit.terms if t.effect in kept), rms, shares)
+    spanned = {name: values for name, values in found.fit.spanned.items() if name in kept}
+    terms = tuple(t for t in found.fit.terms if t.effect in kept)
+    return RotationalFindings(verdicts, terms, rms, shares, spanned)
 
 
 def that_turns(flight: Flight) -> Flight:

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -28,7 +29,7 @@ from trueflight.groundstation.identify.fitting import (
     block_errors,
     variance_per_independent_sample,
 )
-from trueflight.groundstation.identify.spans import EVERYWHERE, Span
+from trueflight.groundstation.identify.spans import EVERYWHERE, Span, changes_of, one_change_less
 from trueflight.models.effect import Effect, Parameter
 
 FAMILY = 0.01
@@ -205,7 +206,15 @@ class Search:
 
     def select(self) -> State:
         """The effects that are missing."""
-        current = self._backward(self.state(self.problem.settled))
+        current = self.grown(self.state(self.problem.settled))
+        for other in self._other_sets(current):
+            if self.evident(other, current) and other.cv_total < current.cv_total:
+                current = other
+        return self.agreed_by_held_out(self._backward(current))
+
+    def grown(self, current: State) -> State:
+        """What the steps end in that begin at `current`."""
+        current = self._backward(current)
         visited = {frozenset(current.choices)}
         while len(current.choices) < MOST_EFFECTS:
             self.progress(f"{len(current.choices)} effects found, looking for the next")
@@ -217,14 +226,11 @@ class Search:
                 break
             visited.add(frozenset(following.choices))
             current = following
-        for other in self._other_sets(current):
-            if self.evident(other, current) and other.cv_total < current.cv_total:
-                current = other
-        return self._agreed_by_held_out(self._backward(current))
+        return current
 
     def settle(self, choices: Sequence[Choice]) -> State:
         """The fit of `choices`, without those that this flight does not support."""
-        return self._agreed_by_held_out(self._backward(self.state(choices)))
+        return self.agreed_by_held_out(self._backward(self.state(choices)))
 
     # --- the steps ------------------------------------------------------------------------------------------
 
@@ -284,18 +290,24 @@ class Search:
         while True:
             weakest = None
             for choice in current.choices:
-                without = self.without(current, choice)
-                useful = (
-                    gain(current, without) > MATERIAL_SHARE
-                    and current.fit.wald(choice.effect) < self.significance
-                    and self.evident(current, without)
-                    and plausible(current.fit, choice.effect)
-                )
-                if not useful and (weakest is None or without.cv_total < weakest.cv_total):
-                    weakest = without
+                for without in self._lesser(current, choice):
+                    useful = (
+                        gain(current, without) > MATERIAL_SHARE
+                        and current.fit.wald(choice.effect) < self.significance
+                        and self.evident(current, without)
+                        and plausible(current.fit, choice.effect)
+                    )
+                    if not useful and (weakest is None or without.cv_total < weakest.cv_total):
+                        weakest = without
             if weakest is None:
                 return current
             current = weakest
+
+    def _lesser(self, current: State, choice: Choice) -> Iterator[State]:
+        """The state without the choice, and those with one of its changes less."""
+        yield self.without(current, choice)
+        for spans in one_change_less(choice.spans):
+            yield self.state([replace(c, spans=spans) if c == choice else c for c in current.choices])
 
     def without(self, current: State, choice: Choice) -> State:
         """The state without the choice, and without those that act only through it."""
@@ -308,7 +320,7 @@ class Search:
         needed = self.problem.effects[choice.effect].acts_through
         return not needed or not set(needed).isdisjoint(present)
 
-    def _agreed_by_held_out(self, current: State) -> State:
+    def agreed_by_held_out(self, current: State) -> State:
         """Drop effects that predict the held-out flight no better than the model without them does, where they act
         there at all."""
         while current.choices:
@@ -444,6 +456,7 @@ class Search:
         rest = [c for c in current.choices if c != choice]
         present = {*self.problem.included, *(c.effect for c in rest)}
         for rival in self.problem.choices:
+            rival = replace(rival, spans=choice.spans)  # a change is stood in for by one at the same moment
             if rival == choice or rival.effect in {c.effect for c in rest} or not self._acts(rival, present):
                 continue
             if not all(self._acts(c, {*present, rival.effect}) for c in rest):
@@ -473,9 +486,25 @@ class Search:
         )
 
     def evident(self, with_: State, without: State) -> bool:
-        """Whether the evidence for `with_` pays for its further parameters (two each, as Akaike's criterion)."""
-        price = 2.0 * (len(with_.fit.free) - len(without.fit.free))
+        """Whether the evidence for `with_` pays for its further parameters (two each, as Akaike's criterion) and for
+        the moments at which it changes: the likeliest of many is likely by chance."""
+        price = self._price(with_) - self._price(without)
         return evidence(self.problem, with_.fit, without.fit) > STRONG_EVIDENCE + price
+
+    def _price(self, state: State) -> float:
+        changes = {t for c in state.choices for t in changes_of(c.spans)}
+        return 2.0 * len(state.fit.free) + 2.0 * float(np.log(self.moments)) * len(changes)
+
+    def score(self, state: State, beside: State) -> float:
+        """What is left with a state, in squared errors worth one independent sample as it is `beside` another one, and
+        the price of its numbers: the lowest is the best."""
+        unit = variance_per_independent_sample(self.problem, beside.fit.residual)
+        return state.fit.sse / unit + state.fit.prior_penalty + self._price(state)
+
+    @cached_property
+    def moments(self) -> float:
+        """How many moments of a change can be told apart: one a second."""
+        return max(2.0, sum(float(m.used.mean() * (m.t[-1] - m.t[0])) for m in self.problem.measurements))
 
     def _shows(self, candidate: State, choice: Choice) -> bool:
         """Whether the flight tells the effect from the simpler ones it may coincide with: at its typical size beyond

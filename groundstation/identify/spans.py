@@ -71,3 +71,39 @@ def cut_at(values: Iterable[Values], flight: int, t: np.ndarray) -> list[slice]:
 def held(values: Values, flight: int, t: float) -> dict[str, float]:
     """Plain numbers at time `t` of flight number `flight`."""
     return {k: v.at(flight, t) if isinstance(v, Piecewise) else v for k, v in values.items()}
+
+
+def moments_of(values: Values) -> set[float]:
+    """Moments at which numbers change, s."""
+    parts = [v.parts for v in values.values() if isinstance(v, Piecewise)]
+    return {t for one in parts for t in changes_of(span for span, _ in one)}
+
+
+def changes_of(spans: Iterable[Span]) -> tuple[float, ...]:
+    """Moments between spans of a flight, s, in order."""
+    ends = {t for span in spans for t in (span.start, span.stop)}
+    return tuple(sorted(t for t in ends if np.isfinite(t)))
+
+
+def split_at(moments: Iterable[float]) -> tuple[Span, ...]:
+    """The spans between moments of a flight; none where there is no moment: the number holds everywhere."""
+    edges = [-np.inf, *sorted(moments), np.inf]
+    return tuple(Span(None, a, b) for a, b in itertools.pairwise(edges)) if len(edges) > 2 else ()
+
+
+def one_change_less(spans: Sequence[Span]) -> list[tuple[Span, ...]]:
+    """The spans with each moment left out in turn, so that one number holds before and after it."""
+    moments = changes_of(spans)
+    return [_merged(spans, moment) for moment in moments]
+
+
+def _merged(spans: Sequence[Span], moment: float) -> tuple[Span, ...]:
+    before = next((s for s in spans if s.stop == moment), None)
+    after = next((s for s in spans if s.start == moment), None)
+    moments = changes_of(spans)
+    earlier = max((t for t in moments if t < moment), default=-np.inf)
+    later = min((t for t in moments if t > moment), default=np.inf)
+    whole = Span(None, earlier if before is None else before.start, later if after is None else after.stop)
+    rest = [s for s in spans if s not in (before, after)]
+    merged = tuple(sorted((*rest, whole), key=lambda s: s.start))
+    return () if merged == (EVERYWHERE,) else merged

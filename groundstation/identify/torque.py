@@ -22,6 +22,7 @@ from trueflight.groundstation.identify.fitting import (
     robust_covariance,
 )
 from trueflight.groundstation.identify.search import Choice, State, whole
+from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Value, number
 from trueflight.groundstation.measured.measurement import Rotation, measure_rotation
 from trueflight.groundstation.results import RotationalRms
 from trueflight.models.effect import Effect, Motion, Parameter
@@ -172,7 +173,8 @@ def _as_late_as_it_acts(
 class TorqueProblem:
     """The angular acceleration of a flight against its rotors' torque and more effects: the `Problem` of a search.
 
-    `effects` are all that act on the torque, `included` those of the model, `candidates` those that may be missing.
+    `effects` are all that act on the torque, `included` those of the model, `candidates` those that may be missing;
+    `weighed_with` are those that are known to change in flight, for the weight of the axes.
     """
 
     turning: Turning
@@ -180,6 +182,7 @@ class TorqueProblem:
     candidates: tuple[str, ...]
     included: tuple[str, ...] = ()
     settled: tuple[Choice, ...] = ()
+    weighed_with: tuple[Choice, ...] = ()
     _seen: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
 
     @cached_property
@@ -204,8 +207,10 @@ class TorqueProblem:
     @cached_property
     def weight(self) -> np.ndarray:
         """Of each axis (A,), s²/rad: one over what is left of it with all candidates fitted."""
+        named = {c.effect: c for c in self.weighed_with}
         everything = tuple(
-            Choice(n, tuple(p.name for p in self._own_parameters(self.effects[n]))) for n in self.candidates
+            named.get(n, Choice(n, tuple(p.name for p in self._own_parameters(self.effects[n]))))
+            for n in self.candidates
         )
         left = self._solve(everything, np.ones(len(self.turning.rotation.axes))).residual
         return 1.0 / np.maximum(np.sqrt(np.mean(left**2, axis=0)), 1e-9)
@@ -229,8 +234,21 @@ class TorqueProblem:
     def _own_parameters(self, effect: Effect) -> tuple[Parameter, ...]:
         return effect.parameters_of(self.turning.motion.vehicle)
 
-    def _own(self, choice: Choice) -> list[Parameter]:
-        return [p for p in self.effects[choice.effect].parameters if p.name in choice.parameters]
+    def _own(self, choice: Choice) -> list[tuple[Parameter, Span]]:
+        return [
+            (p, span)
+            for p in self.effects[choice.effect].parameters
+            if p.name in choice.parameters
+            for span in choice.spans or (EVERYWHERE,)
+        ]
+
+    def _during(self, span: Span, column: np.ndarray) -> np.ndarray:
+        """A column (K, A) in its span, and nothing outside."""
+        if span == EVERYWHERE:
+            return column
+        r = self.turning.rotation
+        t = r.t[r.used]
+        return np.where(((t >= span.start) & (t < span.stop))[:, None], column, 0.0)
 
     def fit(self, choices: tuple[Choice, ...], near: Fit | None = None) -> Fit:
         """The nuisances and the effects of `choices`, fitted together; weighted residuals."""
@@ -238,23 +256,34 @@ class TorqueProblem:
 
     def _solve(self, choices: tuple[Choice, ...], weight: np.ndarray) -> Fit:
         turning = self.turning
-        own = [(c.effect, p) for c in choices for p in self._own(c)]
+        own = [(c.effect, p, span) for c in choices for p, span in self._own(c)]
         linear = np.stack([c for _, c in turning.nuisances], axis=2) * weight[None, :, None]
-        shapes = [self.column(name, p) * weight for name, p in own]
+        shapes = [self._during(span, self.column(name, p)) * weight for name, p, span in own]
         x, jacobian, residual = _through_gains(turning.measured * weight, linear, shapes)
-        neutral = {name: self.effects[name].neutral(turning.motion.vehicle) for name, _ in own}
+        neutral = {name: self.effects[name].neutral(turning.motion.vehicle) for name, _, _ in own}
         free = [
             FreeParameter(name, _nuisance(name), 0.0, -np.inf, np.inf, 0.0, nuisance=True, flat=True)
             for name, _ in turning.nuisances
         ]
         free += [
-            FreeParameter(name, p, 0.0, p.low, p.high, neutral[name][p.name], flat=True) for name, p in own
+            FreeParameter(name, p, 0.0, p.low, p.high, neutral[name][p.name], flat=True, span=span)
+            for name, p, span in own
         ]
         covariance, _ = robust_covariance(self, -jacobian, residual, np.zeros(len(free)))
         r = turning.rotation
         seconds = float(r.used.sum()) * float(np.median(np.diff(r.t)))
         fitted = Fit((), tuple(free), x, covariance, critical_value(seconds), -jacobian, residual)
-        return replace(fitted, terms=tuple(self._term(fitted, c) for c in choices))
+        spanned = {c.effect: self._over_time(fitted, c) for c in choices if c.spans}
+        return replace(fitted, terms=tuple(self._term(fitted, c) for c in choices), spanned=spanned)
+
+    def _over_time(self, fitted: Fit, choice: Choice) -> dict[str, Value]:
+        """The effect's values in each of its spans."""
+        none = self.effects[choice.effect].neutral(self.turning.motion.vehicle)
+        parts: dict[str, list[tuple[Span, float]]] = {}
+        for i in fitted.of(choice.effect):
+            free = fitted.free[i]
+            parts.setdefault(free.parameter.name, []).append((free.span, float(fitted.estimate[i])))
+        return {name: number(own, none[name]) for name, own in parts.items()}
 
     def _term(self, fitted: Fit, choice: Choice) -> Term:
         """The effect with its values and intervals."""
@@ -268,7 +297,10 @@ class TorqueProblem:
     def contribution(self, here: Fit, choice: Choice, through: str | None = None) -> np.ndarray:
         """What the choice at its typical size adds to the weighted angular acceleration, (3 K, P), one column each
         parameter; it is the same beside whatever else acts."""
-        columns = (p.typical * self.column(choice.effect, p) * self.weight for p in self._own(choice))
+        columns = (
+            p.typical * self._during(span, self.column(choice.effect, p)) * self.weight
+            for p, span in self._own(choice)
+        )
         return np.column_stack([c.ravel() for c in columns])
 
     def linearised_gain(self, here: Fit, step: tuple[Choice, ...]) -> float:

@@ -8,13 +8,16 @@ between command and rotors.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from trueflight.groundstation.identify.changes import Drift, in_time, in_words, over_time
 from trueflight.groundstation.identify.doubt import Weighing
+from trueflight.groundstation.identify.drift import at_the_end, beside_drift, drifting
 from trueflight.groundstation.identify.fitting import (
     Fit,
     MeasuredFlights,
@@ -41,7 +44,7 @@ from trueflight.groundstation.identify.verdicts import (
     unmeasured,
 )
 from trueflight.groundstation.measured.measurement import Measurement, measure
-from trueflight.groundstation.results import Diagnosis, EffectVerdict
+from trueflight.groundstation.results import Diagnosis, EffectVerdict, OverTime
 from trueflight.models.effect import Stage
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -88,7 +91,7 @@ def _diagnose(
     held_out = None if validation is None else measured(measure(validation, bandwidth))
     progress("looking at the rotation")
     rotation = judge_rotation(flight, base.names(), base.effects_directory, healthy)
-    entire = ForceProblem(all_of_it, base, held_out, rotation.terms)
+    entire = ForceProblem(all_of_it, base, held_out, rotation.terms, turning_in_time=rotation.spanned)
     parts = _spread(flight, bandwidth) if flight.duration > LONG else ()
     looked_at = replace(entire, flights=measured(*parts)) if parts else entire
     if has_rotor_speeds(flight):
@@ -97,12 +100,30 @@ def _diagnose(
         entire = entire if parts else looked_at
     search = Search(looked_at, progress)
     found = search.select()
-    if not parts:
-        return _report(search, found, search, rotation)
-    progress("fitting what was found to the whole flight")
-    everything = Search(entire, progress)
-    kept = everything.settle(found.choices)
-    return _report(search, search.state(kept.choices), everything, rotation)
+    everything = search
+    if parts:
+        progress("fitting what was found to the whole flight")
+        everything = Search(entire, progress)
+        found = everything.settle(found.choices)
+    progress("looking for what changes in flight")
+    timed = in_time(everything, found)
+    kept = everything.agreed_by_held_out(timed.state)
+    if timed.drift is None or timed.drift.choice not in kept.choices:
+        return _report(search, search.state(kept.choices), everything, rotation)
+    beside, kept, course = beside_drift(entire, kept, timed.drift)
+    diagnosis = _report(beside, kept, beside, rotation, {timed.drift.choice.effect: course})
+    return _with_drift(diagnosis, timed.drift, course)
+
+
+def _with_drift(diagnosis: Diagnosis, drift: Drift, course: OverTime) -> Diagnosis:
+    """The diagnosis with what the drift itself says of its effect, and the model as it is at the end."""
+    name = drift.choice.effect
+    model = diagnosis.model
+    return replace(
+        diagnosis,
+        effects=tuple(drifting(e, drift) if e.name == name else e for e in diagnosis.effects),
+        model=model.with_terms(at_the_end(model.terms, name, course)),
+    )
 
 
 def shown_by_rotors(problem: ForceProblem) -> tuple[Term, ...]:
@@ -136,14 +157,24 @@ def _spread(flight: Flight, bandwidth: float | None) -> tuple[Measurement, ...]:
     return tuple(found)
 
 
-def _report(search: Search, found: State, everything: Search, rotation: RotationalFindings) -> Diagnosis:
+def _report(
+    search: Search,
+    found: State,
+    everything: Search,
+    rotation: RotationalFindings,
+    drifts: Mapping[str, OverTime] = MappingProxyType({}),
+) -> Diagnosis:
     """The verdicts; figures of what was found are those of the whole flight, which `everything` sees."""
     problem, entire = _force(search), _force(everything)
     here = everything.state(found.choices).fit
+    times = {c.effect: t for c in found.choices if (t := over_time(entire, here, c)) is not None}
+    times |= drifts
     m, base = entire.flights.measurements[0], entire.base
     remains = unexplained(m, here.residual)
     doubt = Weighing(entire, here, m.noise[list(m.axes)]) if remains.misfit else None
     verdicts, rate_terms = _verdicts(search, found, here, entire, rotation, doubt)
+    verdicts = in_words(verdicts, times)
+    ended = {v.name for v in verdicts if v.over_time is not None and v.over_time.ended}
     left = float(np.sqrt(here.sse / entire.samples))
     final = model_of(here, base)
     shift = [float(here.estimate[i]) for i, f in enumerate(here.free) if f.nuisance]
@@ -151,7 +182,7 @@ def _report(search: Search, found: State, everything: Search, rotation: Rotation
     return Diagnosis(
         flight=m.flight,
         base=base,
-        model=final.with_terms((*final.terms, *rate_terms)),
+        model=final.with_terms(tuple(t for t in (*final.terms, *rate_terms) if t.effect not in ended)),
         rms_before=float(np.sqrt(entire.mean_square_before)),
         rms_after=left,
         # noise cannot leave more than what is left: a vibration is stronger beyond the pass band than in it

@@ -198,18 +198,16 @@ def also_possible(verdict: EffectVerdict, rivals: tuple[str, ...]) -> EffectVerd
 
 def estimates(fitted: Fit, name: str) -> tuple[ParameterEstimate, ...]:
     """The parameters of an effect with their intervals; an axis that the flight does not measure has none. Of several
-    flights, one that holds for a single one has its number."""
-    return tuple(
-        ParameterEstimate(
-            fitted.free[i].parameter.name,
-            float(fitted.estimate[i]),
-            *fitted.interval(i),
-            fitted.free[i].parameter.unit,
-            "" if fitted.free[i].span.flight is None else str(fitted.free[i].span.flight),
-        )
-        for i in fitted.of(name)
-        if np.any(fitted.jacobian[:, :, i])
-    )
+    flights, one that holds for a single one has its number; of those that change in flight, the last."""
+    last = {(fitted.free[i].parameter.name, fitted.free[i].span.flight): i for i in fitted.of(name)}
+    return tuple(estimate(fitted, i) for i in last.values() if np.any(fitted.jacobian[:, :, i]))
+
+
+def estimate(fitted: Fit, index: int) -> ParameterEstimate:
+    """One free number with its interval."""
+    free = fitted.free[index]
+    p, flight = free.parameter, "" if free.span.flight is None else str(free.span.flight)
+    return ParameterEstimate(p.name, float(fitted.estimate[index]), *fitted.interval(index), p.unit, flight)
 
 
 def _tell(others: Sequence[str], effect: Effect) -> str:

@@ -14,6 +14,7 @@ from trueflight.groundstation.results import (
     Diagnosis,
     EffectVerdict,
     MotorShares,
+    OverTime,
     ParameterEstimate,
     SharedNumber,
     WaterfallStep,
@@ -92,6 +93,7 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
                 "rests_on": e.rests_on,
                 "undetermined": list(e.undetermined),
                 "products": {p.name: interval_table(p) for p in e.products},
+                "over_time": None if e.over_time is None else over_time_table(e.over_time),
             }
             for e in d.effects
         ],
@@ -206,6 +208,28 @@ def shares_table(shares: MotorShares) -> dict[str, Any]:
         "rotor": shares.rotor or None,
         "excess": {"value": shares.excess, "low": shares.excess_low, "high": shares.excess_high},
         "text": shares.told,
+    }
+
+
+def over_time_table(o: OverTime) -> dict[str, Any]:
+    """The JSON of an effect that changes in flight."""
+    return {
+        "changes": [asdict(c) for c in o.changes],
+        "stretches": [
+            {
+                "start": s.start,
+                "stop": s.stop,
+                "absent": s.absent,
+                "parameters": {p.name: interval_table(p) for p in s.parameters},
+            }
+            for s in o.stretches
+        ],
+        "drift": {
+            d.name: {"unit": d.unit, "t": d.times, "value": d.value, "low": d.low, "high": d.high}
+            for d in o.drift
+        },
+        "ended": o.ended,
+        "text": list(o.lines),
     }
 
 

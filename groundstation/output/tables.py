@@ -178,6 +178,8 @@ def _of(d: Diagnosis) -> str:
 
 
 def _parameters(e: EffectVerdict) -> str:
+    if e.over_time is not None:
+        return "\n".join(line.replace("], ", "],\n  ") for line in e.over_time.lines)
     told = [
         f"{p.name} not determined"
         if p.name in e.undetermined

@@ -1,0 +1,96 @@
+"""What begins, ends, changes or drifts in flight is told with its moment, and what does not change is not said to."""
+
+import numpy as np
+import pytest
+from changing import as_if, ramp, step
+from simulated import simulated
+
+from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.results import Diagnosis, EffectVerdict
+from trueflight.models.flight import Flight
+from trueflight.models.model import rigid_body_model
+
+MOMENT = 23.0
+
+
+def said_of(flight: Flight) -> Diagnosis:
+    return diagnose(flight, rigid_body_model(flight.vehicle))
+
+
+def of(found: Diagnosis, name: str) -> EffectVerdict:
+    (verdict,) = (e for e in found.effects if e.name == name)
+    return verdict
+
+
+def sizes(verdict: EffectVerdict, parameter: str) -> list[float]:
+    """The parameter in each stretch of the flight."""
+    assert verdict.over_time is not None
+    return [p.value for s in verdict.over_time.stretches for p in s.parameters if p.name == parameter]
+
+
+@pytest.mark.parametrize(("moment", "gain"), [(12.0, 0.87), (30.0, 1.08)])
+def test_a_load_that_falls_is_a_gain_until_a_moment_and_no_curve(moment: float, gain: float) -> None:
+    flight = simulated(3, "none")
+    found = said_of(as_if(flight, {"thrust_gain": {"gain": step(flight, moment, gain, 1.0)}}))
+    assert found.named("missing") == ("thrust_gain",)
+    verdict = of(found, "thrust_gain")
+    before, after = sizes(verdict, "gain")
+    assert (before, after) == (pytest.approx(gain, abs=0.01), 1.0)
+    (change,) = verdict.over_time.changes
+    assert change.low <= moment <= change.high
+    assert change.time == pytest.approx(moment, abs=1.0)
+    assert "there is nothing to add" in verdict.advice
+    assert "thrust_gain" not in found.model.names()
+    assert not found.unexplained.verdict
+
+
+def test_a_change_beside_what_is_always_there_leaves_that_alone() -> None:
+    flight = simulated(5, "none")
+    gain = step(flight, MOMENT, 1.0, 0.95)
+    found = said_of(as_if(flight, {"rotor_drag": {"x": 0.4, "y": 0.3}, "thrust_gain": {"gain": gain}}))
+    assert set(found.named("missing")) == {"rotor_drag", "thrust_gain"}
+    drag, thrust = of(found, "rotor_drag"), of(found, "thrust_gain")
+    assert drag.over_time is None
+    assert [p.value for p in drag.parameters] == pytest.approx([0.4, 0.3], abs=0.02)
+    assert sizes(thrust, "gain") == pytest.approx([1.0, 0.95], abs=0.01)
+    # the model keeps what holds for the vehicle now
+    (kept,) = (t for t in found.model.terms if t.effect == "thrust_gain")
+    assert kept.values["gain"] == pytest.approx(0.95, abs=0.01)
+    assert thrust.parameters[0].value == kept.values["gain"]
+
+
+def test_drag_that_begins_and_a_load_that_falls_later_are_two_changes() -> None:
+    flight = simulated(3, "none")
+    drag, gain = step(flight, 14.0, 0.0, 0.35), step(flight, 30.0, 0.9, 1.0)
+    found = said_of(as_if(flight, {"rotor_drag": {"x": drag, "y": drag}, "thrust_gain": {"gain": gain}}))
+    assert set(found.named("missing")) == {"rotor_drag", "thrust_gain"}
+    for name, moment in (("rotor_drag", 14.0), ("thrust_gain", 30.0)):
+        (change,) = of(found, name).over_time.changes
+        assert change.low <= moment <= change.high, name
+    assert sizes(of(found, "rotor_drag"), "x") == pytest.approx([0.0, 0.35], abs=0.02)
+
+
+def test_wind_that_turns_at_once_and_wind_that_turns_by_and_by() -> None:
+    flight = simulated(3, "none")
+    blows = {"rotor_drag": {"x": 0.3, "y": 0.3}}
+    turned = {"x": step(flight, MOMENT, 2.0, 0.0), "y": step(flight, MOMENT, 0.0, 2.0)}
+    found = said_of(as_if(flight, {**blows, "wind": turned}))
+    assert {"rotor_drag", "wind"} <= set(found.named("missing"))
+    assert sizes(of(found, "wind"), "y") == pytest.approx([0.0, 2.0], abs=0.1)
+
+    drifts = {"x": ramp(flight, 2.0, -1.0), "y": ramp(flight, 0.0, 2.0)}
+    found = said_of(as_if(flight, {**blows, "wind": drifts}))
+    wind = of(found, "wind")
+    assert wind.verdict == "missing" and not wind.over_time.changes
+    for d in wind.over_time.drift:
+        truth = np.interp(d.times, flight.t, drifts[d.name])
+        held = (d.low <= truth) & (truth <= d.high)
+        assert held.mean() > 0.8, d.name
+        np.testing.assert_allclose(d.value, truth, atol=0.15)
+    assert not found.unexplained.misfit
+
+
+@pytest.mark.parametrize("hidden", ["none", "rotor_drag", "thrust_curve", "battery_sag"])
+def test_what_does_not_change_is_not_said_to(hidden: str) -> None:
+    found = said_of(simulated(6, hidden))
+    assert [e.name for e in found.effects if e.over_time is not None] == []
