@@ -456,7 +456,8 @@ class Search:
         rest = [c for c in current.choices if c != choice]
         present = {*self.problem.included, *(c.effect for c in rest)}
         for rival in self.problem.choices:
-            rival = replace(rival, spans=choice.spans)  # a change is stood in for by one at the same moment
+            if changes_of(choice.spans):
+                rival = replace(rival, spans=choice.spans)  # a change is stood in for by one at the same moment
             if rival == choice or rival.effect in {c.effect for c in rest} or not self._acts(rival, present):
                 continue
             if not all(self._acts(c, {*present, rival.effect}) for c in rest):
