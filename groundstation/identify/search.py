@@ -457,7 +457,9 @@ class Search:
         present = {*self.problem.included, *(c.effect for c in rest)}
         for rival in self.problem.choices:
             if changes_of(choice.spans):
-                rival = replace(rival, spans=choice.spans)  # a change is stood in for by one at the same moment
+                rival = replace(
+                    rival, spans=choice.spans
+                )  # a change is stood in for by one at the same moment
             if rival == choice or rival.effect in {c.effect for c in rest} or not self._acts(rival, present):
                 continue
             if not all(self._acts(c, {*present, rival.effect}) for c in rest):
