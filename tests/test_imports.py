@@ -43,7 +43,7 @@ ROOMS: dict[str, set[str]] = {
     "identify": {"results", "reading", "measured", "design"},
     "evaluate": {"results", "reading", "measured", "design", "identify"},
     "learn": {"measured", "identify", "evaluate"},
-    "versions": {"reading", "measured", "identify"},
+    "versions": {"results", "reading", "measured", "identify"},
     "output": {"results", "reading", "design", "identify", "evaluate", "learn", "versions"},
     "views": {"results", "operate", "evaluate", "learn", "output"},
     "report": {"results", "evaluate", "output"},
