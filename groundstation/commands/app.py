@@ -40,7 +40,7 @@ TASKS = {
         "diagnose", "remainder", "plan-flight", "effects", "effect", "survey", "calibrate", "report",
     ),
     "Make it fly like its design": ("design", "model", "train", "ablate", "collect", "reproduce"),
-    "Fly": ("fly", "deploy", "status", "monitor", "keys"),
+    "Fly": ("fly", "deploy", "status", "monitor", "ros2-bridge", "keys"),
 }  # fmt: skip
 """The commands by what somebody wants to do, in the order in which `--help` shows them."""
 

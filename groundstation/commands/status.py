@@ -14,6 +14,7 @@ from trueflight.groundstation.commands.options import (
     JsonOption,
 )
 from trueflight.groundstation.output.terminal import print_warning
+from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
 
 if TYPE_CHECKING:
@@ -28,6 +29,11 @@ def register(app: typer.Typer) -> None:
         linked(status_command)
     )
     app.command("monitor", epilog="Example: groundstation monitor --save flight.rrd")(linked(monitor_command))
+    app.command(
+        "ros2-bridge",
+        epilog="Example: groundstation ros2-bridge -e tcp/192.168.1.7:7447; then, with "
+        "RMW_IMPLEMENTATION=rmw_zenoh_cpp: ros2 topic list, rviz2, PlotJuggler, foxglove_bridge",
+    )(linked(ros2_command))
 
 
 def _position(position: dict[str, Any]) -> str:
@@ -144,3 +150,35 @@ def monitor_command(
         console.print(f"watching '{link.vehicle}'; Ctrl-C ends", highlight=False)
         seen = monitor(link, save, seconds)
     console.print(f"{seen} ticks seen" + (f", written to {escape(str(save))}" if save is not None else ""))
+
+
+def ros2_command(
+    router: Annotated[
+        str, typer.Option("--router", help="Where rmw_zenoh's router (rmw_zenohd) listens.")
+    ] = "tcp/localhost:7447",
+    domain: Annotated[int, typer.Option("--domain", help="ROS_DOMAIN_ID.", min=0, max=232)] = 0,
+    distribution: Annotated[
+        str, typer.Option("--ros", help="Release of ROS 2: humble, jazzy, kilted.")
+    ] = "jazzy",
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", help="Stop after this long; default: until Ctrl-C.", min=0.1)
+    ] = None,
+    *,
+    settings: Settings,
+) -> None:
+    """Publish a vehicle to ROS 2 (rmw_zenoh): odometry, reference, command, IMU, battery, diagnostics. Needs no ROS."""
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.ros2 import DISTRIBUTIONS, Messages, RosNode, topics_of
+    from trueflight.groundstation.operate.ros2_bridge import Bridge, open_ros
+
+    if distribution not in DISTRIBUTIONS:
+        raise InputError(f"--ros {distribution}: it must be one of {', '.join(DISTRIBUTIONS)}")
+    with open_ros(router) as session, Link(settings) as link:
+        print_warning(link.warning)
+        messages = Messages(link.vehicle, distribution)
+        node = RosNode(session, link.vehicle, messages, domain)
+        names = ", ".join(topic.name for topic in topics_of(link.vehicle).values())
+        console.print(f"publishing {names} on domain {domain}; Ctrl-C ends", highlight=False)
+        seen = Bridge(node, messages).run(link, seconds)
+        console.print(f"{seen} ticks seen, {node.sent} messages published", highlight=False)
+        node.close()
