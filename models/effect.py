@@ -9,7 +9,7 @@ how body rates follow their command; they are seen in the angular acceleration.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -90,8 +90,12 @@ class Motion:
         return a, b, c
 
     def with_(self, **changes: Any) -> Motion:
-        """A copy with some fields changed."""
-        return replace(self, **changes)
+        """A copy with some fields changed. Raises `TypeError` for what is no field."""
+        if unknown := changes.keys() - self.__dict__.keys():
+            raise TypeError(f"a motion has no {', '.join(sorted(unknown))}")
+        copy: Motion = object.__new__(type(self))  # fits make thousands of them
+        copy.__dict__.update(self.__dict__, **changes)
+        return copy
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ Two readings of one motion: the specific force that acts, and, from each rotor's
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,9 @@ from trueflight.models.vehicle import GRAVITY, Vehicle
 
 Chain = Sequence[tuple[Effect, Mapping[str, Any]]]
 """Effects with parameter values, in the order in which they were added."""
+Step = Callable[[Motion], Motion]
+Take = Callable[[Motion, str, tuple[Any, ...], Step], Motion]
+"""How a step of a chain is taken: the motion before it, its name and its numbers, and the step itself."""
 
 
 def motion_of_flight(flight: Flight) -> Motion:
@@ -34,19 +37,19 @@ def motion_of_flight(flight: Flight) -> Motion:
         yaw = euler[:, 2]
         body_to_world = rotation_matrix(flight.quaternion)
         c, s = np.cos(yaw), np.sin(yaw)
-        rotation = body_to_world.copy()
+        rotation = by_column(body_to_world)
         rotation[:, 0] = c[:, None] * body_to_world[:, 0] + s[:, None] * body_to_world[:, 1]
         rotation[:, 1] = -s[:, None] * body_to_world[:, 0] + c[:, None] * body_to_world[:, 1]
-        changes |= {"rotation": rotation, "euler": (euler[:, 0], euler[:, 1]), "cos_yaw": c, "sin_yaw": s}
+        changes |= {"rotation": rotation, "euler": tuple(by_column(euler).T[:2]), "cos_yaw": c, "sin_yaw": s}
         if flight.velocity is not None:
-            changes["air_velocity"] = heading_from_world(flight.velocity, yaw)
+            changes["air_velocity"] = by_column(heading_from_world(flight.velocity, yaw))
     if flight.position is not None:
-        changes["height"] = flight.position[:, 2]
+        changes["height"] = flight.position[:, 2].copy()
     if flight.battery_voltage is not None:
         changes["voltage"] = flight.battery_voltage
     if flight.angular_velocity is not None:
-        changes["body_rate"] = flight.angular_velocity
-        changes["body_acceleration"] = derivative(flight.angular_velocity, flight.t)
+        changes["body_rate"] = by_column(flight.angular_velocity)
+        changes["body_acceleration"] = by_column(derivative(flight.angular_velocity, flight.t))
     if (thrust := rotor_thrust(flight)) is not None:
         changes |= {"rotor_thrust": thrust, "rotor_speed": flight.rotor_speed}
     return Motion(
@@ -60,6 +63,11 @@ def motion_of_flight(flight: Flight) -> Motion:
         delay=flight.vehicle.command_delay,
         **changes,
     )
+
+
+def by_column(array: np.ndarray) -> np.ndarray:
+    """The same array (N, ...), each of its columns in one piece of memory: formulas go through them twice as fast."""
+    return np.moveaxis(np.array(np.moveaxis(array, 0, -1), order="C"), -1, 0)
 
 
 def derivative(column: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -130,31 +138,92 @@ def motion_of_features(columns: Mapping[str, Array], vehicle: Vehicle) -> Motion
     )
 
 
-def apply_effects(motion: Motion, chain: Chain) -> Motion:
+def at_once(motion: Motion, name: str, numbers: tuple[Any, ...], step: Step) -> Motion:
+    """Takes a step of a chain."""
+    return step(motion)
+
+
+def apply_effects(motion: Motion, chain: Chain, take: Take = at_once) -> Motion:
     """The motion with the effects of `chain` acting, stage by stage."""
-    at: dict[Stage, list[tuple[Effect, Mapping[str, Any]]]] = {stage: [] for stage in Stage}
+    motion = _up_to_the_air(motion, chain, take)
+    return _with_effects(motion, chain, (Stage.FORCE, Stage.SENSOR), take)
+
+
+def parts_of_force(motion: Motion, chain: Chain, take: Take = at_once) -> list[np.ndarray]:
+    """What adds up to the specific force (N, 3) of the chain, body axes, m/s²: of the thrust, and of each effect on the
+    forces and on the sensor. Those are taken from a motion without any other force: they have to be `separable`."""
+    turned = [effect for effect, _ in chain if effect.stage in (Stage.ROTATION, Stage.REMAINDER)]
+    if len(turned) == 1 and turned[0].exact_rotation:  # along the body's z axis, to there and back
+        motion = _up_to_the_air(motion, chain, take, turned=False)
+        thrust = take(motion, "thrust along z", (), lambda m: m.with_(force=_along_z(np.asarray(m.thrust))))
+    else:
+        motion = _up_to_the_air(motion, chain, take)
+        thrust = take(motion, "thrust along the body", (), lambda m: m.with_(force=body_thrust(m)))
+    found = [thrust.force]
     for effect, values in chain:
-        at[effect.stage].append((effect, values))
-    for effect, values in at[Stage.COMMAND]:
-        motion = effect.apply(motion, values)
+        if effect.stage in (Stage.FORCE, Stage.SENSOR):
+            acted = take(motion, *named(effect, values))
+            changed = ((acted.force, motion.force), (acted.reading, motion.reading))
+            found += [after for after, before in changed if after is not before]
+    return [np.asarray(part) for part in found]
+
+
+def separable(effect: Effect, motion: Motion, values: Mapping[str, Any]) -> bool:
+    """Whether what an effect does can be told apart from what others do: one on the air, the forces or the sensor must
+    not ask for the acceleration by the thrust; one on the forces or the sensor adds to them what it adds to none, and
+    does nothing else."""
+    if effect.stage not in (Stage.AIR, Stage.FORCE, Stage.SENSOR):
+        return True
+    motion = _up_to_the_air(motion, (), at_once, turned=False)
+    try:
+        effect.apply(motion, values)
+    except Exception:  # noqa: BLE001 - a user's formula may fail in any way where something is None
+        return False
+    if effect.stage is Stage.AIR:
+        return True
+    pushed = motion.with_(force=motion.force + 1.0, reading=motion.reading - 0.5)
+    alone, beside = effect.apply(motion, values), effect.apply(pushed, values)
+    for name, before in vars(motion).items():
+        here = getattr(alone, name)
+        if name in ("force", "reading"):
+            added = getattr(beside, name) - getattr(pushed, name)
+            if not np.allclose(here - before, added, rtol=1e-9, atol=1e-9, equal_nan=True):
+                return False
+        elif here is not before:
+            return False
+    return True
+
+
+def _up_to_the_air(motion: Motion, chain: Chain, take: Take, turned: bool = True) -> Motion:
+    """All stages from the command to the velocity of the air; thrust that is not `turned` has a magnitude alone."""
+    motion = _with_effects(motion, chain, (Stage.COMMAND,), take)
     if motion.tau > 0.0 or motion.delay > 0.0:
-        motion = _with_actuation(motion)
-    for effect, values in at[Stage.THRUST]:
-        motion = effect.apply(motion, values)
-    if motion.euler is not None:
-        motion = motion.with_(thrust_acceleration=linear_thrust(motion))
+        motion = take(motion, "actuation", (), _with_actuation)
+    motion = _with_effects(motion, chain, (Stage.THRUST,), take)
+    turned = turned and motion.euler is not None
+    if turned:
+        motion = take(motion, "linear thrust", (), _with_linear_thrust)
     if motion.torque is not None:
         motion = motion.with_(torque=rotor_torque(motion))
-        for effect, values in at[Stage.TORQUE]:
-            motion = effect.apply(motion, values)
-    for effect, values in at[Stage.RATE]:
-        motion = effect.apply(motion, values)
-    stages = (Stage.ROTATION, Stage.REMAINDER, Stage.AIR, Stage.FORCE, Stage.SENSOR)
+        motion = _with_effects(motion, chain, (Stage.TORQUE,), take)
+    motion = _with_effects(motion, chain, (Stage.RATE,), take)
     # without attitude there is nothing to rotate: thrust is compared along the body's axis
-    for stage in stages if motion.euler is not None else stages[1:]:
-        for effect, values in at[stage]:
-            motion = effect.apply(motion, values)
+    rotation = (Stage.ROTATION,) if turned else ()
+    return _with_effects(motion, chain, (*rotation, Stage.REMAINDER, Stage.AIR), take)
+
+
+def _with_effects(motion: Motion, chain: Chain, stages: Sequence[Stage], take: Take) -> Motion:
+    for stage in stages:
+        for effect, values in chain:
+            if effect.stage is stage:
+                motion = take(motion, *named(effect, values))
     return motion
+
+
+def named(effect: Effect, values: Mapping[str, Any]) -> tuple[str, tuple[Any, ...], Step]:
+    """An effect with its values as a step of a chain."""
+    numbers = tuple(values.get(p.name) for p in effect.parameters)
+    return effect.name, numbers, lambda motion: effect.apply(motion, values)
 
 
 def _with_actuation(motion: Motion) -> Motion:
@@ -162,6 +231,10 @@ def _with_actuation(motion: Motion) -> Motion:
     speed = np.sqrt(np.clip(motion.command, 0.0, None))
     acting = lagged(delayed(speed, motion.delay, motion.dt), motion.tau, motion.dt) ** 2
     return motion.with_(command=acting, thrust=acting)
+
+
+def _with_linear_thrust(motion: Motion) -> Motion:
+    return motion.with_(thrust_acceleration=linear_thrust(motion))
 
 
 def linear_thrust(motion: Motion) -> Array:
@@ -206,11 +279,21 @@ def acceleration(motion: Motion) -> Array:
 
 def specific_force(motion: Motion) -> np.ndarray:
     """What the accelerometer reads (N, 3), body axes, m/s²; without attitude, thrust along the body's z axis."""
+    return np.asarray(body_thrust(motion) + motion.force + motion.reading)
+
+
+def body_thrust(motion: Motion) -> np.ndarray:
+    """The part of it (N, 3) that the rotors' thrust gives."""
     if motion.rotation is None:
-        return motion.force + motion.reading + np.outer(motion.thrust, [0.0, 0.0, 1.0])
+        return _along_z(motion.thrust)
     r, (x, y, z) = motion.rotation, motion.thrust_acceleration.T
-    thrust = np.stack([r[:, 0, j] * x + r[:, 1, j] * y + r[:, 2, j] * z for j in range(3)], axis=-1)
-    return thrust + motion.force + motion.reading
+    return np.stack([r[:, 0, j] * x + r[:, 1, j] * y + r[:, 2, j] * z for j in range(3)], axis=-1)
+
+
+def _along_z(thrust: np.ndarray) -> np.ndarray:
+    force = np.zeros((3, len(thrust))).T
+    force[:, 2] = thrust
+    return force
 
 
 def error_acceleration(motion: Motion, chain: Chain) -> Array:

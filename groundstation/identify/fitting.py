@@ -12,19 +12,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
 from scipy import special
 
+from trueflight.groundstation.identify.kept import Kept
 from trueflight.groundstation.identify.noisy_inputs import without_noise
 from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Value, Values, cut_at, held, number
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.models.effect import Effect, Motion, Parameter, Stage
 from trueflight.models.effects import CLOCK, catalogue, effect_named
 from trueflight.models.model import Model, Term
-from trueflight.models.prediction import Chain, apply_effects, motion_of_flight, specific_force
+from trueflight.models.prediction import (
+    Chain,
+    apply_effects,
+    motion_of_flight,
+    parts_of_force,
+    separable,
+    specific_force,
+)
 from trueflight.models.vehicle import Vehicle
 
 HAC_LAG = 2.0
@@ -32,6 +41,8 @@ HAC_LAG = 2.0
 UNMODELLED = 0.02
 """m/s²: slow model error that every flight is granted, for the weight of the prior: 2 mg, the bias stability of a
 MEMS accelerometer."""
+KEPT_PROMISE = 0.75
+"""Part of the promised gain from which on a step's Jacobian is near enough to be kept."""
 BLOCK = 5.0
 """s of each held-out block."""
 
@@ -120,14 +131,16 @@ class MeasuredFlights:
         a number is only predicted anew where it holds."""
         names = [tuple(p.name for p in effect.parameters_of(self.vehicle)) for effect in effects]
 
+        def chain(key: tuple[tuple[float, ...], ...]) -> Chain:
+            return [(e, dict(zip(n, k, strict=True))) for e, n, k in zip(effects, names, key, strict=True)]
+
         def force(flight: int, key: tuple[tuple[float, ...], ...]) -> np.ndarray:
-            values = (dict(zip(n, k, strict=True)) for n, k in zip(names, key, strict=True))
-            return self.acting(flight, list(zip(effects, values, strict=True)))
+            return self.acting(flight, chain(key))
 
         piece = lru_cache(maxsize=keep)(force) if keep else force
 
         def all_of_it(flight: int, key: tuple[tuple[float, ...], ...]) -> np.ndarray:
-            return self.behind_filter(self.measurements[flight], piece(flight, key))
+            return self.seen(flight, chain(key))
 
         seen = lru_cache(maxsize=keep)(all_of_it) if keep else all_of_it
 
@@ -151,7 +164,34 @@ class MeasuredFlights:
 
     def acting(self, flight: int, chain: Chain) -> np.ndarray:
         """What the chain makes of all samples of flight number `flight`: specific force (N, 3), body axes, m/s²."""
-        return specific_force(apply_effects(self.motions[flight], [*chain, *self.always]))
+        return specific_force(
+            apply_effects(self.motions[flight], [*chain, *self.always], self.kept[flight].take)
+        )
+
+    def seen(self, flight: int, chain: Chain) -> np.ndarray:
+        """The used samples (K, A) of what the chain makes of flight number `flight`, behind its filter, part by part:
+        those that have been seen before are not filtered again."""
+        kept = self.kept[flight]
+        if not all(self._separable(effect, flight) for effect, _ in [*chain, *self.always]):
+            return self.behind_filter(self.measurements[flight], self.acting(flight, chain))
+        parts = parts_of_force(self.motions[flight], [*chain, *self.always], kept.take)
+        return np.asarray(sum(map(kept.seen, parts)))
+
+    def _separable(self, effect: Effect, flight: int) -> bool:
+        """Whether what an effect does can be seen apart from what others do."""
+        if effect.name not in self._asked:
+            motion = self.motions[flight]
+            self._asked[effect.name] = separable(effect, motion, effect.typical(motion))
+        return self._asked[effect.name]
+
+    @cached_property
+    def _asked(self) -> dict[str, bool]:
+        return {}
+
+    @cached_property
+    def kept(self) -> tuple[Kept, ...]:
+        """What has been computed of each flight."""
+        return tuple(Kept(len(m.flight), partial(self.behind_filter, m)) for m in self.measurements)
 
     def behind_filter(self, m: Measurement, acting: np.ndarray) -> np.ndarray:
         """The used samples (K, A) of what acts, behind the flight's filter."""
@@ -316,6 +356,7 @@ def fit(
     pinned: Mapping[tuple[str, str, Span], float] | None = None,
     spans: Mapping[tuple[str, str], tuple[Span, ...]] | None = None,
     given: Mapping[str, Values] | None = None,
+    near: Fit | None = None,
 ) -> Fit:
     """Fit the parameters of `terms` (all of them, or the effects named in `refit`) to the flights.
 
@@ -323,7 +364,8 @@ def fit(
     clock is better than that, and a shift must not be taken for drag. Each parameter that `spans` names, by effect and
     parameter, is fitted once for each of its spans; outside of them it is without effect. `pinned` holds numbers, by
     effect, parameter and span, where they are; `given` are numbers by effect that are not fitted and differ between
-    spans.
+    spans. `near` is a fit whose optimum is not far: the clock begins there, and so do the derivatives of the numbers
+    that both have.
     """
     effects = {t.effect: effect_named(t.effect, problem.effects_directory) for t in terms}
     fixed = {t.effect: dict(t.values) for t in terms}
@@ -336,9 +378,12 @@ def fit(
     if clock and not any(effect.shifts_clock for effect in effects.values()):
         (parameter,), believed = CLOCK.parameters, problem.vehicle.command_delay
         low, high = max(0.0, believed - period), believed + period
-        free.append(
-            FreeParameter(CLOCK.name, parameter, believed, low, high, believed, period, nuisance=True)
+        begin = (
+            next((x for f, x in zip(near.free, near.estimate, strict=True) if f.nuisance), believed)
+            if near
+            else believed
         )
+        free.append(FreeParameter(CLOCK.name, parameter, begin, low, high, believed, period, nuisance=True))
         effects[CLOCK.name] = CLOCK
     free = [
         replace(f, span=span)
@@ -366,8 +411,13 @@ def fit(
 
     weight = np.sqrt(problem.unit()) / np.array([f.spread for f in free])
     neutral = np.array([f.neutral for f in free])
+    known = (
+        {f.number: column for f, column in _columns(near) if near.residual.shape == measured.shape}
+        if near
+        else {}
+    )
     if free:
-        estimate, flat, jacobian = _minimise(residual, free, weight, neutral, tolerance)
+        estimate, flat, jacobian = _minimise(residual, free, weight, neutral, tolerance, known)
     else:
         estimate, flat, jacobian = np.zeros(0), residual(np.zeros(0)), np.zeros((measured.size, 0))
     k, a = measured.shape
@@ -389,6 +439,11 @@ def fit(
     return Fit(fitted, tuple(free), estimate, covariance, critical, shaped, flat.reshape(k, a), spanned)
 
 
+def _columns(near: Fit) -> list[tuple[FreeParameter, np.ndarray]]:
+    """The free numbers of a fit with their columns (K A,) of the Jacobian."""
+    return [(f, near.jacobian[:, :, i].ravel()) for i, f in enumerate(near.free)]
+
+
 def _pieces(problem: MeasuredFlights, numbers: Sequence[tuple[str, str, Span]]) -> int:
     """How many predictions of pieces are worth keeping: those of the point at which one number after the other is
     moved, and as many on the way to the next; none where every number holds everywhere."""
@@ -402,13 +457,16 @@ def _minimise(
     weight: np.ndarray,
     neutral: np.ndarray,
     tolerance: float,
+    known: Mapping[tuple[str, str, Span], np.ndarray],
     most: int = 25,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Bounded Levenberg-Marquardt (Nocedal & Wright, Numerical Optimization, 2nd ed., ch. 10): estimate, residual there
     and Jacobian beside it.
 
     Nearly all effects are linear in their parameters, so that two steps are enough; a step that meets a bound is taken
-    again with that number held.
+    again with that number held. While steps do what their Jacobian promises, it is only brought up to date with what
+    they changed (Broyden, Math. Comput. 19, 1965); the last step goes by one that was computed where it begins. The
+    first may have columns that are `known` from nearby.
     """
     low = np.array([f.low for f in free])
     high = np.array([max(f.high, f.low + 1e-9) for f in free])
@@ -420,30 +478,44 @@ def _minimise(
         return float(flat @ flat + np.sum((weight * (x - neutral)) ** 2))
 
     cost, damping = cost_of(x, flat), 1e-8
-    jacobian = _jacobian(residual, x, free, flat)
+    jacobian, exact = _jacobian(residual, x, free, flat, known), not known
     for _ in range(most):
         normal = jacobian.T @ jacobian + np.diag(weight**2)
         slope = jacobian.T @ flat + weight**2 * (x - neutral)
-        moved = False
-        for _ in range(8):
+        moved = there_already = False
+        for _ in range(8 if exact else 2):
             step = _bounded_step(normal + damping * np.diag(np.diag(normal)), slope, x, low, high)
+            promised = -float(step @ (2.0 * slope + normal @ step))
+            there_already = promised < 0.1 * tolerance * cost
+            if there_already:
+                break
             tried = residual(x + step)
             there = cost_of(x + step, tried)
             if there <= cost:
                 moved = True
                 break
             damping = max(damping, 1e-6) * 30.0
-        if not moved:
+        if exact and (there_already or not moved):
             break
+        if not moved:
+            jacobian, exact = _jacobian(residual, x, free, flat), True
+            continue
         gained = cost - there
+        change = tried - flat
         x, flat, cost, damping = x + step, tried, there, damping / 10.0
         small = gained < tolerance * cost or bool(np.all(np.abs(step) < 1e-5 * spread))
-        if small and bool(np.all(np.abs(step) < 0.05 * spread)):
+        if small and exact and bool(np.all(np.abs(step) < 0.05 * spread)):
             break
-        jacobian = _jacobian(residual, x, free, flat)
-        if small:
-            break
-    return x, flat, jacobian
+        if small or gained < KEPT_PROMISE * promised:
+            ending = small and exact
+            jacobian, exact = _jacobian(residual, x, free, flat), True
+            if ending:
+                break
+        else:
+            length = step / spread**2
+            jacobian = jacobian + np.outer(change - jacobian @ step, length / (length @ step))
+            exact = False
+    return x, flat, jacobian if exact else _jacobian(residual, x, free, flat)
 
 
 def _bounded_step(
@@ -471,10 +543,15 @@ def _jacobian(
     x: np.ndarray,
     free: Sequence[FreeParameter],
     base: np.ndarray,
+    known: Mapping[tuple[str, str, Span], np.ndarray] = MappingProxyType({}),
 ) -> np.ndarray:
-    """Forward differences with steps of a hundredth of each prior's width, away from the upper bound."""
+    """Forward differences with steps of a hundredth of each prior's width, away from the upper bound; columns that are
+    `known` as they are."""
     columns = np.empty((base.size, len(x)))
     for i, f in enumerate(free):
+        if f.number in known:
+            columns[:, i] = known[f.number]
+            continue
         step = 0.01 * f.spread
         if x[i] + step > f.high:
             step = -step

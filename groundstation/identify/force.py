@@ -123,12 +123,17 @@ class ForceProblem:
         terms = self._placed(terms, added)
         spans = self._spans(choices)
         given = self.turning_in_time
-        fitted = fit(self.flights, terms, refit=free, spans=spans, given=given)
-        if through := [n for n in added if self.effects[n].acts_through]:
+        fitted = fit(self.flights, terms, refit=free, spans=spans, given=given, near=near)
+        if through := [n for n in added if self._new_to(start, n, added)]:
             # what acts through another can balance it far from the best fit: begin once more from "none of it"
             other = fit(self.flights, self._anew(terms, through), refit=free, spans=spans, given=given)
             fitted = other if evidence(self, other, fitted) > 0.0 else fitted
         return fitted
+
+    def _new_to(self, start: Mapping[str, Mapping[str, float]], name: str, added: Sequence[str]) -> bool:
+        """Whether an effect acts through another, and both were not fitted together at the `start`."""
+        through = set(self.effects[name].acts_through)
+        return bool(through) and not {name, *(through & set(added))} <= set(start)
 
     def _spans(self, choices: Sequence[Choice]) -> dict[tuple[str, str], tuple[Span, ...]]:
         """The spans of every number that holds not everywhere, by effect and parameter; where an effect acts does not

@@ -159,6 +159,7 @@ def _cost(problem: ForceProblem, here: Fit, i: int, at: float, unit: float) -> f
         pinned={free.number: at},
         spans=problem.spans_of(here),
         given=problem.turning_in_time,
+        near=here,
     )
     return max((held.sse - here.sse) / unit, 0.0)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from trueflight.groundstation.identify.fitting import HAC_LAG, UNMODELLED, MeasuredFlights
 from trueflight.groundstation.measured.measurement import Measurement
+from trueflight.models.effect import Motion
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.prediction import Chain, apply_effects, motion_of_flight
@@ -28,8 +29,15 @@ class MeasuredRotors(MeasuredFlights):
 
     def acting(self, flight: int, chain: Chain) -> np.ndarray:
         """Specific thrust (N, 1), m/s², that the chain makes of the command of flight number `flight`."""
-        level = self.motions[flight].with_(rotor_thrust=None, torque=None)
-        return np.asarray(apply_effects(level, chain).thrust)[:, None]
+        return np.asarray(apply_effects(self._levels[flight], chain, self.kept[flight].take).thrust)[:, None]
+
+    def seen(self, flight: int, chain: Chain) -> np.ndarray:
+        """The used samples (K, 1) of what the chain makes of flight number `flight`, behind its filter."""
+        return self.behind_filter(self.measurements[flight], self.acting(flight, chain))
+
+    @cached_property
+    def _levels(self) -> tuple[Motion, ...]:
+        return tuple(motion.with_(rotor_thrust=None, torque=None) for motion in self.motions)
 
     def behind_filter(self, m: Measurement, acting: np.ndarray) -> np.ndarray:
         """The used samples (K, 1) of the thrust, behind the flight's filter."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from trueflight.groundstation.measured.attitude_rate import that_turns
+from trueflight.groundstation.measured.low_pass import density, gain, low_pass
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.frames import rotate, rotate_inverse
@@ -92,12 +92,8 @@ def measure_rotation(flight: Flight, bandwidth: float = ROTATION_BANDWIDTH) -> R
         return None
     if from_attitude is not None:
         bandwidth = from_attitude.band
-    sos = signal.butter(4, bandwidth, fs=fs, output="sos")
     rows = np.arange(0, len(flight), max(1, int(fs / (2.5 * bandwidth))))
-
-    def smooth(x: np.ndarray) -> np.ndarray:
-        return _low_pass(x, sos, pieces, fs)[rows]
-
+    smooth = _filter(bandwidth, fs, pieces, rows)
     used = np.ones(len(flight), dtype=bool) if flight.flying is None else flight.flying.copy()
     edge = max(2, int(0.5 / bandwidth / flight.dt))
     for piece in pieces:
@@ -114,7 +110,11 @@ def measure_rotation(flight: Flight, bandwidth: float = ROTATION_BANDWIDTH) -> R
         smooth=smooth,
         bandwidth=bandwidth,
         noise=_noise(
-            flight.angular_velocity if from_attitude is None else from_attitude.rough, used, sos, fs, True
+            flight.angular_velocity if from_attitude is None else from_attitude.rough,
+            used,
+            bandwidth,
+            fs,
+            True,
         ),
         # an angle that was made of accelerations is no attitude to differentiate
         axes=(0, 2) if from_attitude is not None and "pitch" in flight.unlogged else (0, 1, 2),
@@ -122,29 +122,21 @@ def measure_rotation(flight: Flight, bandwidth: float = ROTATION_BANDWIDTH) -> R
     )
 
 
-def _low_pass(x: np.ndarray, sos: np.ndarray, pieces: list[slice], fs: float) -> np.ndarray:
-    """Zero-phase low-pass of columns (N, k) that reaches across no gap.
+def _filter(
+    bandwidth: float, fs: float, pieces: list[slice], rows: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A low-pass of columns (N, k) at the `rows` of a flight that reaches across no gap between its `pieces`."""
+    every = int(rows[1] - rows[0]) if len(rows) > 1 else 1
 
-    As `scipy.signal.sosfiltfilt`, which works out the filter's steady state anew at every call.
-    """
-    out = np.empty_like(x)
-    steady = _steady_state(sos.tobytes())
-    for piece in pieces:
-        part = x[piece]
-        pad = min(len(part) - 1, int(fs))
-        extended = np.concatenate(
-            [2.0 * part[:1] - part[pad:0:-1], part, 2.0 * part[-1:] - part[-2 : -pad - 2 : -1]]
-        )
-        forward, _ = signal.sosfilt(sos, extended, axis=0, zi=steady[:, :, None] * extended[0])
-        backward, _ = signal.sosfilt(sos, forward[::-1], axis=0, zi=steady[:, :, None] * forward[-1])
-        out[piece] = backward[::-1][pad : pad + len(part)]
-    return out
+    def smooth(x: np.ndarray) -> np.ndarray:
+        if len(pieces) == 1 and pieces[0] == slice(0, len(x)):
+            return low_pass(x, bandwidth, fs, every)
+        out = np.array(x, dtype=float)
+        for piece in pieces:
+            out[piece] = low_pass(x[piece], bandwidth, fs)
+        return out[rows]
 
-
-@cache
-def _steady_state(sos: bytes) -> np.ndarray:
-    """State of the filter under a constant one, (sections, 2)."""
-    return signal.sosfilt_zi(np.frombuffer(sos).reshape(-1, 6))
+    return smooth
 
 
 def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -> Measurement:
@@ -162,17 +154,11 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
         )
     raw, differentiate, default = _sensed(flight)
     bandwidth = min(bandwidth or default, 0.4 * min(fs, flight.sensor_rate or fs))
-    sos = signal.butter(4, bandwidth, fs=fs, output="sos")
     step = max(1, int(fs / (2.5 * bandwidth))) if thin else 1
     rows = np.arange(0, len(flight), step)
     pieces = _pieces(flight)
 
-    def low_pass(x: np.ndarray) -> np.ndarray:
-        return _low_pass(x, sos, pieces, fs)
-
-    def smooth(x: np.ndarray) -> np.ndarray:
-        return low_pass(x)[rows]
-
+    smooth = _filter(bandwidth, fs, pieces, rows)
     if differentiate:
         quaternion = flight.quaternion[rows]  # type: ignore[index]
 
@@ -187,9 +173,9 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
             # a central difference averages acceleration over two periods: so does the model's side
             for piece in pieces:
                 world[piece] = ndimage.correlate1d(world[piece], [0.25, 0.5, 0.25], axis=0, mode="nearest")
-            return rotate_inverse(quaternion, low_pass(world)[rows])
+            return rotate_inverse(quaternion, smooth(world))
 
-        value = rotate_inverse(quaternion, (low_pass(slope(raw)) + np.array([0.0, 0.0, GRAVITY]))[rows])
+        value = rotate_inverse(quaternion, smooth(slope(raw)) + np.array([0.0, 0.0, GRAVITY]))
     else:
 
         def see(force: np.ndarray) -> np.ndarray:
@@ -199,7 +185,7 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
     used, left_out = _used(flight, bandwidth)
     # of values that a log repeats, only the new ones tell the noise
     every = max(1, round(fs / flight.sensor_rate)) if flight.sensor_rate else 1
-    its_own = signal.butter(4, min(bandwidth, 0.45 * fs / every), fs=fs / every, output="sos")
+    its_own = min(bandwidth, 0.45 * fs / every)
     noise = _noise(raw[::every], used[::every], its_own, fs / every, differentiate)
     return Measurement(
         flight=flight,
@@ -270,7 +256,7 @@ def _used(flight: Flight, bandwidth: float) -> tuple[np.ndarray, dict[str, float
     return used, left_out
 
 
-def _noise(raw: np.ndarray, used: np.ndarray, sos: np.ndarray, fs: float, differentiate: bool) -> np.ndarray:
+def _noise(raw: np.ndarray, used: np.ndarray, bandwidth: float, fs: float, differentiate: bool) -> np.ndarray:
     """RMS (3,) of sensor noise behind the filter, as if it were white there.
 
     The smaller of two estimates: from third differences of the raw signal, which motion leaves alone (the median makes
@@ -279,14 +265,14 @@ def _noise(raw: np.ndarray, used: np.ndarray, sos: np.ndarray, fs: float, differ
     """
     third = np.diff(raw, n=3, axis=0)[used[3:]] if used[3:].sum() > 50 else np.diff(raw, n=3, axis=0)
     sigma = np.median(np.abs(third), axis=0) / 0.6745 / np.sqrt(20.0)
-    w, h = signal.sosfreqz(sos, worN=512, fs=fs)
-    gain = np.abs(h) ** 2  # forward and backward
-    edge = float(w[np.flatnonzero(gain > 0.5)[-1]])
+    w = np.arange(512) * fs / 1024.0
+    passed = gain(w, bandwidth, fs)
+    edge = float(w[np.flatnonzero(passed > 0.5)[-1]])
     count = min(len(raw), round(2.0 * fs))
-    frequency, density = signal.welch(raw, fs=fs, nperseg=count, axis=0)
+    frequency, power = density(raw, fs, count)
     beyond = (frequency > 1.25 * edge) & (frequency < min(2.5 * edge, 0.48 * fs))
     if beyond.sum() >= 4:
-        sigma = np.minimum(sigma, np.sqrt(density[beyond].mean(axis=0) * 0.5 * fs))
+        sigma = np.minimum(sigma, np.sqrt(power[beyond].mean(axis=0) * 0.5 * fs))
     if differentiate:
-        gain = gain * np.sin(2 * np.pi * w / fs) * fs
-    return sigma * float(np.sqrt(np.mean(gain**2)))
+        passed = passed * np.sin(2 * np.pi * w / fs) * fs
+    return sigma * float(np.sqrt(np.mean(passed**2)))

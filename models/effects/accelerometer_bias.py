@@ -7,8 +7,8 @@ from trueflight.models.effect import FLIGHT, Array, Effect, Motion, Parameter, S
 
 def formula(motion: Motion, *, x: Array, y: Array, z: Array) -> Motion:
     """`f_measured = f + (x, y, z)`, body axes, m/s²: an error of the reading, not of the flight."""
-    xp = array_namespace(motion.thrust)
-    one = 0.0 * motion.thrust + 1.0
+    xp = array_namespace(motion.reading)
+    one = 0.0 * motion.reading[:, 0] + 1.0
     return motion.with_(reading=motion.reading + xp.stack([x * one, y * one, z * one], axis=-1))
 
 

@@ -7,7 +7,7 @@ from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
 
 def formula(motion: Motion, *, x: Array, y: Array, z: Array) -> Motion:
     """`f_measured = f + dw/dt x r + w x (w x r)`, with r = (x, y, z) in m from the centre of mass, body axes."""
-    xp = array_namespace(motion.thrust)
+    xp = array_namespace(motion.body_rate)
     p, q, r = (motion.body_rate[:, i] for i in range(3))
     dp, dq, dr = (motion.body_acceleration[:, i] for i in range(3))
     along = p * x + q * y + r * z

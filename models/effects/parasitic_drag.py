@@ -7,7 +7,7 @@ from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
 
 def formula(motion: Motion, *, x: Array, y: Array, z: Array) -> Motion:
     """`a = -diag(x, y, z) v_air |v_air|`, body axes; `x`, `y`, `z` in 1/m are `rho C_d A / 2 m` of each face."""
-    xp = array_namespace(motion.thrust)
+    xp = array_namespace(motion.air_velocity)
     ahead, left, up = motion.body_velocity
     speed = xp.sqrt(ahead * ahead + left * left + up * up + 1e-12)
     force = xp.stack([-x * ahead * speed, -y * left * speed, -z * up * speed], axis=-1)

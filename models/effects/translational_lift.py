@@ -11,7 +11,7 @@ def formula(motion: Motion, *, lift: Array) -> Motion:
     At the same rotor speed a rotor in edgewise flow gives more thrust, by the square of the airspeed and, to that
     order, whatever the rotor speed: `lift` in 1/m is that gain over mass.
     """
-    xp = array_namespace(motion.thrust)
+    xp = array_namespace(motion.air_velocity)
     ahead, left, _ = motion.body_velocity
     force = xp.stack([0.0 * ahead, 0.0 * ahead, lift * (ahead * ahead + left * left)], axis=-1)
     return motion.with_(force=motion.force + force)

@@ -7,7 +7,7 @@ from trueflight.models.effect import FLIGHT, Array, Effect, Motion, Parameter, S
 
 def formula(motion: Motion, *, x: Array, y: Array) -> Motion:
     """`v_air = v - w`, with w = (x, y, 0) in m/s, world ENU: where the air moves to."""
-    xp = array_namespace(motion.thrust)
+    xp = array_namespace(motion.air_velocity)
     ahead = motion.cos_yaw * x + motion.sin_yaw * y
     left = -motion.sin_yaw * x + motion.cos_yaw * y
     wind = xp.stack([ahead, left, 0.0 * ahead], axis=-1)
