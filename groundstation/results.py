@@ -304,6 +304,14 @@ class Gusts:
     time_constant: ParameterEstimate
     speed: float | None = None
 
+    @property
+    def text(self) -> str:
+        """The gusts in words."""
+        a, tau = self.acceleration, self.time_constant
+        pushes = f"{a.value:.2g} m/s² [{a.low:.2g}, {a.high:.2g}] on world x and y"
+        size = pushes if self.speed is None else f"{self.speed:.2g} m/s ({pushes})"
+        return f"gusts of {size}, {tau.value:.2g} s [{tau.low:.2g}, {tau.high:.2g}]"
+
 
 @dataclass(frozen=True)
 class EffectVerdict:

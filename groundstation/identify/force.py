@@ -259,6 +259,17 @@ class ForceProblem:
         left = np.sqrt(np.mean(here.residual**2, axis=0))
         return here.residual.shape[1] != len(noise) or bool(np.all(left < ADEQUATE * noise))
 
+    def push_of_air(self, here: Fit) -> float | None:
+        """The acceleration that a metre per second of wind gives beside what is fitted, 1/s; None where no drag is."""
+        for effect in self.effects.values():
+            own = sizes(effect)
+            if effect.stage is Stage.AIR and own and effect.needs_yaw and all(p.unit == "m/s" for p in own):
+                speeds = np.array([p.typical for p in own])
+                pushes = self.contribution(here, whole(effect)) / speeds
+                push = float(np.sqrt(np.mean(np.sum(pushes**2, axis=0)) / len(here.residual)))
+                return push if push > 0.0 else None
+        return None
+
     def scale_of_thrust(self, here: Fit) -> tuple[tuple[str, ...], np.ndarray] | None:
         """The effects that scale the thrust as a whole, and what they change in the prediction (K A,)."""
         scales = tuple(n for n, e in self.effects.items() if e.scales_rotors)

@@ -9,11 +9,16 @@ spectrum is like the one that is left.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import optimize, special
+
+from trueflight.groundstation.identify.adequacy import ABOVE, MATERIAL, spectrum_of
+from trueflight.groundstation.measured.measurement import Measurement
+from trueflight.groundstation.results import Gusts, ParameterEstimate, Unexplained
+from trueflight.models.frames import rotate
 
 FASTEST = 0.2
 """s: what is quicker is vibration or a control loop, not the air."""
@@ -24,6 +29,45 @@ BANDS = 8
 ALIKE = 1e-3
 """Probability that gusts are said to be none."""
 SURE = 1.96
+
+
+UPWARDS = 0.5
+"""Most of what is left upwards over what is left sideways, both RMS beyond the noise: drag gives gusts little hold
+there."""
+
+
+def gusts_of(m: Measurement, residual: np.ndarray, remains: Unexplained, push: float | None) -> Gusts | None:
+    """The gusts in a residual (K, 3) of the used samples; None where what `remains` is none. `push` is the acceleration
+    that a metre per second of wind gives, 1/s, None where no drag is known."""
+    lines = [x for x in remains.misfit if x.held and x.axis != "z"]
+    if not remains.misfit or lines or m.axes != (0, 1, 2) or m.flight.quaternion is None:
+        return None
+    world = rotate(m.flight.quaternion[m.rows][m.used], residual)
+    noise = float(np.sqrt(np.mean(m.noise[:2] ** 2)))
+    rms = np.sqrt(np.mean(world**2, axis=0))
+    beyond = np.sqrt(np.maximum(rms**2 - np.array([noise, noise, m.noise[2]]) ** 2, 0.0))
+    sideways = float(np.sqrt(np.mean(beyond[:2] ** 2)))
+    if np.any(rms[:2] < ABOVE * noise) or sideways < MATERIAL or beyond[2] > UPWARDS * sideways:
+        return None
+    spectra = [spectrum_of(m, world[:, i], noise) for i in (0, 1)]
+    f = spectra[0].frequency
+    passed = 1.0 / (1.0 + (f / m.bandwidth) ** 8) ** 2
+    found = process_of(f, [s.power for s in spectra], [s.noise for s in spectra], passed)
+    if found is None:
+        return None
+    size = ParameterEstimate("acceleration", found.size, found.size_low, found.size_high, "m/s^2")
+    time_constant = ParameterEstimate("time_constant", found.time_constant, found.low, found.high, "s")
+    return Gusts(size, time_constant, None if not push else found.size / push)
+
+
+def told_as_gusts(remains: Unexplained, gusts: Gusts) -> Unexplained:
+    """What remains with the gusts in the place of the axes on which they are seen."""
+    theirs = {x.text for x in remains.misfit}
+    return replace(
+        remains,
+        where=(gusts.text, *(w for w in remains.where if w not in theirs)),
+        advice="the air moves by itself: nothing in the model can foresee it; fly in calmer air for a closer look",
+    )
 
 
 @dataclass(frozen=True)
@@ -93,7 +137,7 @@ def _alike(f: np.ndarray, observed: np.ndarray, expected: np.ndarray) -> bool:
     return True
 
 
-def _curvature(cost, x: np.ndarray, step: float = 0.02) -> np.ndarray:  # type: ignore[no-untyped-def]
+def _curvature(cost: Callable[[np.ndarray], float], x: np.ndarray, step: float = 0.02) -> np.ndarray:
     """Second derivatives (n, n) of a function at its minimum, by central differences."""
     n, eye = len(x), step * np.eye(len(x))
     out = np.empty((n, n))

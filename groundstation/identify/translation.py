@@ -24,6 +24,7 @@ from trueflight.groundstation.identify.fitting import (
     model_of,
 )
 from trueflight.groundstation.identify.force import ForceProblem, mean_square_before
+from trueflight.groundstation.identify.gusts import gusts_of, told_as_gusts
 from trueflight.groundstation.identify.lateness import late_instead
 from trueflight.groundstation.identify.one_by_one import shares, with_shares
 from trueflight.groundstation.identify.rates import judge_rates
@@ -171,6 +172,7 @@ def _report(
     times |= drifts
     m, base = entire.flights.measurements[0], entire.base
     remains = unexplained(m, here.residual)
+    gusts = gusts_of(m, here.residual, remains, entire.push_of_air(here)) if remains.misfit else None
     doubt = Weighing(entire, here, m.noise[list(m.axes)]) if remains.misfit else None
     verdicts, rate_terms = _verdicts(search, found, here, entire, rotation, doubt)
     verdicts = in_words(verdicts, times)
@@ -195,7 +197,8 @@ def _report(
         else float(np.sqrt(after / held_out.measured().size)),
         clock_shift=shift[0] - problem.flights.vehicle.command_delay if shift else None,
         effects=tuple(verdicts),
-        unexplained=remains,
+        unexplained=remains if gusts is None else told_as_gusts(remains, gusts),
+        gusts=gusts,
         left_out=m.left_out,
         rotational=rotation.rms,
         alternatives=tuple(s.names for s in search.near(found)),

@@ -4,6 +4,7 @@ accelerometer."""
 from dataclasses import replace
 
 import numpy as np
+from scipy import signal
 
 from trueflight.models.effects import effect_named
 from trueflight.models.flight import Flight
@@ -38,12 +39,18 @@ def gusty(flight: Flight, speed: float, time_constant: float, drag: float, seed:
     """The flight in horizontal gusts of an RMS `speed`, m/s, for each axis of the world, and `time_constant` s, that
     act through a linear `drag`, 1/s."""
     rng = np.random.default_rng(seed)
-    kept = np.exp(-flight.dt / time_constant)
     wind = np.zeros((len(flight), 3))
-    shocks = rng.normal(0.0, speed * np.sqrt(1.0 - kept**2), (len(flight), 2))
-    wind[0, :2] = rng.normal(0.0, speed, 2)
-    for k in range(1, len(flight)):
-        wind[k, :2] = kept * wind[k - 1, :2] + shocks[k]
+    wind[:, :2] = lagged_noise(rng, len(flight), flight.dt, speed, time_constant)
     assert flight.specific_force is not None and flight.quaternion is not None
     pushed = flight.specific_force + rotate_inverse(flight.quaternion, drag * wind)
     return replace(flight, specific_force=pushed)
+
+
+def lagged_noise(
+    rng: np.random.Generator, count: int, period: float, size: float, time_constant: float
+) -> np.ndarray:
+    """Two columns (count, 2) of noise through a first-order lag, RMS `size`, sampled every `period` s."""
+    kept = np.exp(-period / time_constant)
+    shocks = rng.normal(0.0, size * np.sqrt(1.0 - kept**2), (count, 2))
+    shocks[0] = rng.normal(0.0, size, 2)
+    return np.asarray(signal.lfilter([1.0], [1.0, -kept], shocks, axis=0))

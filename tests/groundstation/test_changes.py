@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from changing import as_if, ramp, step
+from changing import as_if, gusty, lagged_noise, ramp, step
 from simulated import simulated
 
+from trueflight.groundstation.identify.gusts import process_of
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.results import Diagnosis, EffectVerdict
 from trueflight.models.flight import Flight
@@ -94,3 +95,34 @@ def test_wind_that_turns_at_once_and_wind_that_turns_by_and_by() -> None:
 def test_what_does_not_change_is_not_said_to(hidden: str) -> None:
     found = said_of(simulated(6, hidden))
     assert [e.name for e in found.effects if e.over_time is not None] == []
+
+
+def test_gusts_are_told_by_size_and_time_constant_and_are_no_effect() -> None:
+    still = simulated(3, "none")
+    found = said_of(gusty(as_if(still, {"rotor_drag": {"x": 0.4, "y": 0.4}}), 1.5, 1.0, 0.4))
+    assert found.gusts is not None
+    assert found.gusts.time_constant.value == pytest.approx(1.0, rel=0.5)
+    assert found.gusts.acceleration.value == pytest.approx(0.4 * 1.5, rel=0.3)
+    assert found.unexplained.where == (found.gusts.text,)
+    assert [e.name for e in found.effects if e.over_time is not None] == []
+    assert set(found.named("missing")) <= {"rotor_drag"}
+
+
+def test_a_process_is_known_within_its_interval_and_a_line_is_none() -> None:
+    rng = np.random.default_rng(2)
+    period, count, held = 0.02, 4500, []
+
+    def spectrum(column: np.ndarray) -> np.ndarray:
+        power = np.abs(np.fft.rfft(column - column.mean())) ** 2
+        return power / power.sum() * column.var()
+
+    f = np.fft.rfftfreq(count, period)
+    noise = [np.full(len(f), 0.05**2 / len(f))] * 2
+    for _ in range(20):
+        columns = lagged_noise(rng, count, period, 0.5, 1.5) + rng.normal(0.0, 0.05, (count, 2))
+        found = process_of(f, [spectrum(c) for c in columns.T], noise, np.ones(len(f)))
+        assert found is not None
+        held.append(found.low <= 1.5 <= found.high)
+    assert np.mean(held) >= 0.75
+    swings = 0.5 * np.sin(2.0 * np.pi * 0.6 * period * np.arange(count)) + rng.normal(0.0, 0.05, count)
+    assert process_of(f, [spectrum(swings)] * 2, noise, np.ones(len(f))) is None
