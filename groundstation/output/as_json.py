@@ -13,6 +13,7 @@ from trueflight.groundstation.results import (
     Comparison,
     Diagnosis,
     EffectVerdict,
+    Gusts,
     MotorShares,
     OverTime,
     ParameterEstimate,
@@ -100,6 +101,7 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
         "remarks": list(d.remarks),
         "alternatives": [list(names) for names in d.alternatives],
         "unexplained": asdict(d.unexplained),
+        "gusts": None if d.gusts is None else gusts_table(d.gusts),
         "nuisance": {"clock_shift": {"value": d.clock_shift, "unit": "s"}},
         "left_out": d.left_out,
         **_several_tables(d),
@@ -208,6 +210,16 @@ def shares_table(shares: MotorShares) -> dict[str, Any]:
         "rotor": shares.rotor or None,
         "excess": {"value": shares.excess, "low": shares.excess_low, "high": shares.excess_high},
         "text": shares.told,
+    }
+
+
+def gusts_table(g: Gusts) -> dict[str, Any]:
+    """The JSON of gusts."""
+    return {
+        "acceleration": interval_table(g.acceleration),
+        "time_constant": interval_table(g.time_constant),
+        "speed": g.speed,
+        "text": g.text,
     }
 
 
