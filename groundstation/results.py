@@ -356,6 +356,74 @@ class RotationalRms:
 
 
 @dataclass(frozen=True)
+class VehicleNumber:
+    """A number of the vehicle as a flight shows it, with its 95 % interval, beside what its file believes (None where
+    it says nothing). `told` says what it rests on."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    believed: float | None
+    told: str = ""
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What the rotation of a flight says of the vehicle: `numbers`, and which part of the variance of the angular
+    acceleration below `bandwidth` Hz their model explains about each of the `axes`; `undetermined` are the names of
+    those that it does not tell, for too little is explained. `source` as in `RotationalRms`."""
+
+    flight: str
+    numbers: tuple[VehicleNumber, ...]
+    undetermined: tuple[str, ...]
+    axes: tuple[str, ...]
+    explained: tuple[float, ...]
+    bandwidth: float
+    source: str
+
+
+@dataclass(frozen=True)
+class StateError:
+    """Error of the full state `horizon` s after a start, mean over `starts`: of the lengths of the errors of position
+    (m), velocity (m/s) and body rates (rad/s), and of the angle between the attitudes (rad)."""
+
+    horizon: float
+    position: float
+    velocity: float
+    attitude: float
+    rate: float
+    starts: int
+
+
+@dataclass(frozen=True)
+class FullState:
+    """The full state of a flight predicted from its inputs alone, by a model of the thrust and forces called `label`
+    and by one of the rotation, whose `inputs` are "motors" or "commands"."""
+
+    flight: str
+    label: str
+    inputs: str
+    errors: tuple[StateError, ...]
+
+
+@dataclass(frozen=True)
+class IdentifiedVehicle:
+    """A vehicle identified from its flights: `numbers` by each that shows them, `model` of the thrust and forces, the
+    `delay` and `lag` in s between the `inputs` ("motors" or "commands") and the rotation, and the full state predicted
+    on the flights that were `fitted` and on the one `held_out`, None without one."""
+
+    numbers: tuple[Identified, ...]
+    model: Model
+    inputs: str
+    delay: float
+    lag: float
+    fitted: tuple[FullState, ...]
+    held_out: FullState | None
+
+
+@dataclass(frozen=True)
 class MotorShares:
     """What each of R rotors carries of the thrust, on the mean of a flight.
 

@@ -145,6 +145,12 @@ def test_models_against_flights_say_the_same_with_a_recording_as_without(flown: 
         "bound": [run("groundstation bound", flight, *more) for more in ((), saved)],
         "diagnose": [run("groundstation diagnose", flight, *more) for more in ((), saved)],
     }
+    told = run("groundstation identify", flight)
+    assert told["inputs"] == "motors" and [e["horizon"] for e in told["fitted"][0]["errors"]] == [
+        0.1,
+        0.5,
+        1.0,
+    ]
     for name, (without, with_recording) in runs.items():
         assert without.keys() == with_recording.keys(), name
         assert without["recording"] is None and with_recording["recording"] == str(saved[1]), name

@@ -19,6 +19,7 @@ from trueflight.groundstation.commands import (
     effect,
     flights,
     fly,
+    identify,
     keys,
     model,
     plan,
@@ -37,7 +38,7 @@ TASKS = {
     "Begin here": ("demo",),
     "Look at flights": ("flights", "import", "compare", "where", "track", "bound"),
     "Find what is missing": (
-        "diagnose", "remainder", "plan-flight", "effects", "effect", "survey", "calibrate", "report",
+        "diagnose", "identify", "remainder", "plan-flight", "effects", "effect", "survey", "calibrate", "report",
     ),
     "Make it fly like its design": ("design", "model", "train", "ablate", "collect", "reproduce"),
     "Fly": ("fly", "deploy", "status", "monitor", "ros2-bridge", "keys"),
@@ -70,6 +71,7 @@ collect.register(app)
 keys.register(app)
 reproduce.register(app)
 remainder.register(app)
+identify.register(app)
 plan.register(app)
 survey.register(app)
 calibrate.register(app)

@@ -22,7 +22,13 @@ from trueflight.groundstation.evaluate.where import where_it_fails
 from trueflight.groundstation.identify.fitting import MeasuredFlights, fit, model_of
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.measured.measurement import measure
-from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
+from trueflight.groundstation.results import (
+    Comparison,
+    Diagnosis,
+    Identified,
+    WaterfallStep,
+    WhereItFails,
+)
 from trueflight.models.design import Design
 from trueflight.models.effects import effect_named
 from trueflight.models.errors import InputError
@@ -69,7 +75,7 @@ class Analysis:
     base, then one for each effect found, the most important first; `held_out` the same on the held-out flight, empty
     without one. `first` is the place of the base among them. `where` tells where the base fails, `where_left` where
     the last model still does, in the same bins. `tracking` is there where the flight has references and a design,
-    `reference` where it has references.
+    `reference` where it has references; `identified` are the vehicle's numbers, where it has rotor data.
     """
 
     diagnosis: Diagnosis
@@ -83,6 +89,7 @@ class Analysis:
     reference: ReferenceDistance | None
     side_by_side: SideBySide | None
     provenance: Provenance
+    identified: Identified | None = None
 
     @property
     def flight(self) -> Flight:

@@ -23,7 +23,7 @@ from trueflight.groundstation.identify.fitting import (
 )
 from trueflight.groundstation.identify.search import Choice, State, whole
 from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Value, number
-from trueflight.groundstation.measured.measurement import Rotation, measure_rotation
+from trueflight.groundstation.measured.measurement import ROTATION_BANDWIDTH, Rotation, measure_rotation
 from trueflight.groundstation.results import RotationalRms
 from trueflight.models.effect import Effect, Motion, Parameter
 from trueflight.models.flight import Flight
@@ -112,9 +112,10 @@ class Turning:
         return block
 
 
-def turning_of(flight: Flight) -> Turning | None:
-    """The rotation of a flight with rotor speeds or motor commands; None where it cannot be compared."""
-    rotation = measure_rotation(flight)
+def turning_of(flight: Flight, bandwidth: float = ROTATION_BANDWIDTH) -> Turning | None:
+    """The rotation of a flight with rotor speeds or motor commands, below `bandwidth` Hz; None where it cannot be
+    compared."""
+    rotation = measure_rotation(flight, bandwidth)
     if rotation is None:
         return None
     flight = rotation.flight

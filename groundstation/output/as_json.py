@@ -13,7 +13,10 @@ from trueflight.groundstation.results import (
     Comparison,
     Diagnosis,
     EffectVerdict,
+    FullState,
     Gusts,
+    Identified,
+    IdentifiedVehicle,
     MotorShares,
     OverTime,
     ParameterEstimate,
@@ -196,6 +199,56 @@ def fleet_table(fleet: Fleet) -> dict[str, Any]:
         for h in fleet.histories
     ]
     return {**asdict(fleet), "histories": vehicles}
+
+
+def numbers_table(found: Identified) -> dict[str, Any]:
+    """The JSON of a vehicle's numbers as one flight shows them."""
+    return {
+        "flight": found.flight,
+        "source": found.source,
+        "bandwidth_hz": found.bandwidth,
+        "explained": dict(zip(found.axes, found.explained, strict=True)),
+        "undetermined": list(found.undetermined),
+        "numbers": {
+            n.name: {
+                "value": n.value,
+                "low": n.low,
+                "high": n.high,
+                "unit": n.unit,
+                "believed": n.believed,
+                "rests_on": n.told,
+            }
+            for n in found.numbers
+        },
+    }
+
+
+def full_state_table(found: FullState) -> dict[str, Any]:
+    """The JSON of the full state predicted on one flight."""
+    return {
+        "flight": found.flight,
+        "model": found.label,
+        "inputs": found.inputs,
+        "errors": [asdict(e) for e in found.errors],
+        "unit": {"position": "m", "velocity": "m/s", "attitude": "rad", "rate": "rad/s"},
+    }
+
+
+def identified_table(found: IdentifiedVehicle) -> dict[str, Any]:
+    """The JSON of an identified vehicle."""
+    return plain(
+        {
+            "vehicle": found.model.vehicle.name,
+            "numbers": [numbers_table(n) for n in found.numbers],
+            "model": found.model.label,
+            "effects": list(found.model.names()),
+            "inputs": found.inputs,
+            "delay": {"value": found.delay, "unit": "s"},
+            "lag": {"value": found.lag, "unit": "s"},
+            "fitted": [full_state_table(f) for f in found.fitted],
+            "held_out": None if found.held_out is None else full_state_table(found.held_out),
+        }
+    )
 
 
 def shares_table(shares: MotorShares) -> dict[str, Any]:
@@ -406,6 +459,8 @@ def analysis_table(a: Analysis) -> dict[str, Any]:
         "titles": {e.name: effect_named(e.name, d.base.effects_directory).title for e in d.effects},
         "provenance": asdict(a.provenance),
     }
+    if a.identified is not None:
+        table["identify"] = numbers_table(a.identified)
     return plain(table)
 
 

@@ -13,7 +13,14 @@ from rich.text import Text
 
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.output.several_tables import print_several
-from trueflight.groundstation.results import Comparison, Diagnosis, EffectVerdict, WaterfallStep, WhereItFails
+from trueflight.groundstation.results import (
+    Comparison,
+    Diagnosis,
+    EffectVerdict,
+    IdentifiedVehicle,
+    WaterfallStep,
+    WhereItFails,
+)
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model
 
@@ -273,3 +280,46 @@ def print_model(console: Console, model: Model) -> None:
 def fit_rms(model: Model) -> float:
     """Residual RMS of the fit, m/s²: of the network's training where there is one."""
     return model.fit.get("rms", 0.0) if model.network is None else model.network.fit.get("train_rms", 0.0)
+
+
+def print_identified(console: Console, found: IdentifiedVehicle) -> None:
+    """The vehicle's numbers as each flight shows them, and how well its full state is predicted."""
+    for each in found.numbers:
+        table = Table(title=f"{each.flight}: the vehicle's numbers", title_justify="left")
+        for head in ("number", "95 % interval", "believed", "rests on"):
+            table.add_column(head, no_wrap=head != "rests on")
+        for n in each.numbers:
+            believed = "" if n.believed is None else f"{n.believed:.4g}"
+            interval = f"{n.value:.4g} [{n.low:.4g}, {n.high:.4g}] {n.unit}"
+            table.add_row(n.name, interval, believed, n.told)
+        if each.numbers:
+            console.print(table)
+        if each.undetermined:
+            console.print(f"{each.flight}: does not tell {', '.join(each.undetermined)}", highlight=False)
+        explained = ", ".join(
+            f"{percent(e)} about {a}" for a, e in zip(each.axes, each.explained, strict=True)
+        )
+        console.print(
+            f"explained of the angular acceleration below {each.bandwidth:.0f} Hz ({each.source}): {explained}",
+            style="dim", highlight=False,
+        )  # fmt: skip
+    if not found.fitted and found.held_out is None:
+        console.print(
+            "the full state is not predicted: it needs position, velocity, attitude and a second of flight"
+        )
+        return
+    table = Table(title="full state predicted, mean error", title_justify="left")
+    for head in ("flight", "after", "position m", "velocity m/s", "attitude rad", "rate rad/s"):
+        table.add_column(head, justify="left" if head == "flight" else "right")
+    for state, name in [(f, f.flight) for f in found.fitted] + (
+        [] if found.held_out is None else [(found.held_out, f"{found.held_out.flight} (held out)")]
+    ):
+        for e in state.errors:
+            table.add_row(
+                name, f"{e.horizon:g} s", f"{e.position:.3f}", f"{e.velocity:.3f}", f"{e.attitude:.3f}",
+                f"{e.rate:.3f}",
+            )  # fmt: skip
+            name = ""
+    console.print(table)
+    told = f"from {found.inputs}, by {', '.join(found.model.names()) or 'the linear model'}"
+    console.print(f"{told}; as in IDSIA's nano-drone benchmark", style="dim", highlight=False)

@@ -67,7 +67,6 @@ def flown(
         torque = believed * (60.0 * error + 25.0 * integral - 14.0 * rate)
         collective = mass * GRAVITY * (1.0 + swing * wanted[k, 3])
         command = np.clip(mixer @ np.array([collective, *torque]), 1e-3, None)
-        speed = speed + (np.sqrt(command) - speed) * (1.0 if lag == 0.0 else 1.0 - np.exp(-dt / lag))
         thrust = strength * speed**2
         acting = torque_of @ thrust
         if k % 2 == 0:
@@ -76,6 +75,7 @@ def flown(
             log["command"].append(command)
             log["speed"].append(speed.copy())
             log["force"].append(np.array([0.0, 0.0, thrust.sum() / mass]))
+        speed = speed + (np.sqrt(command) - speed) * (1.0 if lag == 0.0 else 1.0 - np.exp(-dt / lag))
         p, q, r = rate  # w x I w, written out
         euler = np.array(
             [
