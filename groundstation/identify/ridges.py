@@ -15,6 +15,7 @@ import numpy as np
 
 from trueflight.groundstation.identify.fitting import Fit, fit, variance_per_independent_sample
 from trueflight.groundstation.identify.force import ForceProblem
+from trueflight.groundstation.identify.search import whole
 from trueflight.groundstation.identify.verdicts import MISSING, POSSIBLE
 from trueflight.groundstation.results import EffectVerdict, ParameterEstimate
 
@@ -24,6 +25,8 @@ STEPS = (1.0, 2.0, 4.0, 8.0)
 """Half widths of the interval at the optimum at which the profile is asked, until it has left the interval."""
 HALVINGS = 3
 """Times that the step in which the profile leaves the interval is halved; the outer end is taken."""
+CARRIES = 0.1
+"""Overlap of the axes from which one number is said to act through another."""
 SPAN = 6.0
 """Most by which the ends of an interval may differ, as a factor, for the number to be called determined."""
 
@@ -41,6 +44,11 @@ class Ridge:
     product: ParameterEstimate
     flight: str = ""
 
+    @property
+    def where(self) -> str:
+        """The flight behind a name, where it holds for one of several."""
+        return f"@{self.flight}" if self.flight else ""
+
 
 def ridges(problem: ForceProblem, here: Fit, found: Sequence[str]) -> tuple[Ridge, ...]:
     """What is known of each number of the effects `found` that act through another, and of those of the others, where
@@ -50,18 +58,44 @@ def ridges(problem: ForceProblem, here: Fit, found: Sequence[str]) -> tuple[Ridg
     for name in found:
         carriers = [n for n in problem.effects[name].acts_through if here.of(n)]
         # of what changes in flight, the last
-        for i in {here.free[i].parameter.name: i for i in here.sizes(name)}.values():
+        last = {(here.free[i].parameter.name, here.free[i].span.flight): i for i in here.sizes(name)}
+        shares = _axes_of(problem, here, name, carriers) if several and carriers else {}
+        for i in last.values():
             others = [j for n in carriers for j in here.sizes(n)]
             if not others or _sharp(here, i) or not np.any(here.jacobian[:, :, i]):
                 continue
             partner = max(others, key=lambda j: abs(_correlation(here, i, j)))
-            if several and _sharp(here, partner):
-                continue  # other flights determine it, and beside it the number is as good as linear
+            if several and all(_sharp(here, j) for j in _carrying(here, i, others, shares)):
+                continue  # other flights determine them, and beside them the number is as good as linear
             pair = [_ridge(problem, here, i, partner)]
             if not pair[0].determined and not _sharp(here, partner):
                 pair.append(_ridge(problem, here, partner, i))
             told += pair
     return tuple(told)
+
+
+def _axes_of(problem: ForceProblem, here: Fit, name: str, carriers: Sequence[str]) -> dict[int, np.ndarray]:
+    """How what each number of an effect does is spread over the measured axes (A,), through `carriers` of a typical
+    size: at the size that was found, next to nothing may carry it."""
+    own = here.sizes(name)
+    through = (problem.contribution(here, whole(problem.effects[name]), n) for n in carriers)
+    columns = sum(np.abs(c) for c in through)
+    energy = np.sum(np.reshape(columns, (*here.residual.shape, -1)) ** 2, axis=0)
+    if energy.shape[1] != len(own):
+        return {}
+    return {i: energy[:, k] / max(float(energy[:, k].sum()), 1e-30) for k, i in enumerate(own)}
+
+
+def _carrying(here: Fit, i: int, others: Sequence[int], shares: dict[int, np.ndarray]) -> list[int]:
+    """Those of the numbers `others` that act on the axes on which number `i` does."""
+    if i not in shares:
+        return list(others)
+    found = []
+    for j in others:
+        energy = np.sum(here.jacobian[:, :, j] ** 2, axis=0)
+        overlap = float(shares[i] @ energy) / max(float(energy.sum()), 1e-30)
+        found += [j] if overlap > CARRIES else []
+    return found or list(others)
 
 
 def with_ridges(verdicts: Sequence[EffectVerdict], told: Sequence[Ridge]) -> list[EffectVerdict]:
@@ -88,8 +122,8 @@ def with_ridges(verdicts: Sequence[EffectVerdict], told: Sequence[Ridge]) -> lis
                 v,
                 verdict=v.verdict if known or v.verdict != MISSING else POSSIBLE,
                 parameters=parameters,
-                undetermined=tuple(r.parameter for r in loose),
-                products=tuple(r.product for r in loose),
+                undetermined=tuple(r.parameter + r.where for r in loose),
+                products=tuple(replace(r.product, name=r.product.name + r.where) for r in loose),
             )
         )
     return out

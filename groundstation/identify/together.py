@@ -318,7 +318,7 @@ class _Joint:
             rotational=rotation.rms,
             alternatives=tuple(s.names for s in search.near(found)),
             flights=tuple(each),
-            shared=(*shared, *rotation.shared),
+            shared=tuple(n for n in (*shared, *rotation.shared) if _is_known(n, verdicts)),
             set_aside=set_aside,
             held_out_model=None if checked is None else model_of(checked, self.base),
         )
@@ -395,7 +395,17 @@ class _Joint:
             replace(p, flight=self.names[int(p.flight)]) if p.flight.isdecimal() else p
             for p in verdict.parameters
         )
-        return replace(verdict, parameters=named)
+
+        def told(text: str) -> str:
+            name, at, flight = text.rpartition("@")
+            return f"{name}@{self.names[int(flight)]}" if at and flight.isdecimal() else text
+
+        return replace(
+            verdict,
+            parameters=named,
+            undetermined=tuple(map(told, verdict.undetermined)),
+            products=tuple(replace(p, name=told(p.name)) for p in verdict.products),
+        )
 
     def _vehicles(
         self, entire: JointForce, here: Fit, found: State, others: Sequence[Term]
@@ -422,6 +432,11 @@ def _joint(search: Search) -> JointForce:
 
 def _at(value: float | Piecewise, flight: int) -> float:
     return value.at(flight, 0.0) if isinstance(value, Piecewise) else float(value)
+
+
+def _is_known(number: SharedNumber, verdicts: Sequence[EffectVerdict]) -> bool:
+    """Whether the flights determine the number at all: else nothing is said of its being the same."""
+    return not any(v.name == number.effect and number.parameter in v.undetermined for v in verdicts)
 
 
 def _within_a_set(answer: SharedNumber, effect: Effect) -> SharedNumber:

@@ -20,7 +20,9 @@ def print_several(console: Console, d: Diagnosis) -> None:
     table.add_column("its own numbers, 95 % interval")
     for f in d.flights:
         own = [
-            f"{e.name} {told(p)}"
+            f"{e.name} {p.name} not determined"
+            if f"{p.name}@{p.flight}" in e.undetermined
+            else f"{e.name} {told(p)}"
             for e in d.effects
             if e.verdict in ("missing", "possible")
             for p in e.parameters

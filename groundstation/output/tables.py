@@ -196,7 +196,12 @@ def _parameters(e: EffectVerdict) -> str:
     ]
     own = dict.fromkeys(p.name for p in e.parameters if p.flight)
     told += [f"{', '.join(own)}: each flight's own"] if own else []
-    told += [f"{p.name} = {p.value:.3g}  [{p.low:.3g}, {p.high:.3g}]" for p in e.products]
+    several = any(p.flight for p in e.parameters)
+    told += [
+        f"{p.name} = {p.value:.3g}  [{p.low:.3g}, {p.high:.3g}]"
+        for p in e.products
+        if not several or "@" not in p.name
+    ]
     return "\n".join(told)
 
 

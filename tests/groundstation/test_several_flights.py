@@ -25,7 +25,7 @@ from trueflight.models.effects import effect_named
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.model import rigid_body_model
-from trueflight.models.reference import trajectory
+from trueflight.models.reference import trajectory, trajectory_from_csv
 from trueflight.sim_bridge.truth.hidden import Hidden
 
 DRAG = 0.25
@@ -229,3 +229,26 @@ def test_a_models_version_takes_what_is_the_vehicles_and_says_what_it_left_out(t
     done = programs.run("groundstation", "model", "add", "wind", *flights, *store)
     assert done.returncode == 2
     assert "wind is each flight's own, and no part of a vehicle's model" in done.stderr
+
+
+@pytest.mark.long
+def test_what_no_flight_moved_across_stays_undetermined_in_all_of_them(tmp_path: Path) -> None:
+    t = np.arange(0.0, 30.0, 0.1)
+    fade = np.clip(t / 3.0, 0.0, 1.0) * np.clip((30.0 - t) / 3.0, 0.0, 1.0)
+    x = 1.5 * np.sin(2.0 * np.pi * 0.15 * t) * fade
+    rows = "\n".join(f"{a:.2f},{b:.4f},0,1.5,0" for a, b in zip(t, x, strict=True))
+    along_x = trajectory_from_csv(f"t,x,y,z,yaw\n{rows}\n")
+    flights = []
+    for seed, east in enumerate((0.0, -4.0)):
+        path = tmp_path / f"flight-{seed}.mcap"
+        fly_with(path, drag_in_wind(east, 0.0), seed, along_x)
+        flights.append(read_flight(path))
+    d = diagnosed(*flights)
+    found = {e.name: e for e in d.effects if e.verdict in ("missing", "possible")}
+    drag = {p.name: p for p in found["rotor_drag"].parameters}
+    assert drag["x"].low < DRAG < drag["x"].high
+    assert "y" in found["rotor_drag"].undetermined
+    own = {(p.name, p.flight): p for p in found["wind"].parameters}
+    assert own["x", "flight-1"].value == pytest.approx(-4.0, rel=0.05)
+    for flight in ("flight-0", "flight-1"):
+        assert own["y", flight].low < 0.0 < own["y", flight].high
