@@ -12,7 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import fft
 
+from trueflight.groundstation.measured.low_pass import low_pass
 from trueflight.groundstation.reading import segments
 from trueflight.models.contract import ACTUATION_LIMITS
 from trueflight.models.flight import Flight
@@ -43,22 +45,21 @@ class RateLoop:
 
 def fit_rate_loop(flights: Sequence[Flight]) -> RateLoop | None:
     """The rate loop of these flights; None where they lack the columns, do not turn, or do not fit the model."""
-    from scipy import optimize, signal
+    from scipy import optimize
 
     pieces = _pieces(flights)
     if not pieces:
         return None
     filtered = []
     for command, rate, dt in pieces:
-        sos = signal.butter(2, min(BANDWIDTH, 0.4 / dt), fs=1.0 / dt, output="sos")
-        filtered.append((command, signal.sosfiltfilt(sos, rate, axis=0), sos, dt))
-    total = float(np.concatenate([rate.ravel() for _, rate, _, _ in filtered]).var())
+        filtered.append((command, _smooth(rate, dt), dt))
+    total = float(np.concatenate([rate.ravel() for _, rate, _ in filtered]).var())
 
     def misfit(x: np.ndarray) -> np.ndarray:
         out = []
-        for command, rate, sos, dt in filtered:
+        for command, rate, dt in filtered:
             skip = int(0.5 / dt)  # the model starts at rest, the vehicle does not
-            out.append((signal.sosfiltfilt(sos, respond(command, dt, *x), axis=0) - rate)[skip:].ravel())
+            out.append((_smooth(respond(command, dt, *x), dt) - rate)[skip:].ravel())
         return np.concatenate(out)
 
     most = [ACTUATION_LIMITS[name] for name in ("rate_delay", "rate_lag", "rate_integral")]
@@ -71,7 +72,7 @@ def fit_rate_loop(flights: Sequence[Flight]) -> RateLoop | None:
     if unexplained > _MOST_UNEXPLAINED:
         return None
     delay, lag, integral = (float(x) for x in best.x)
-    seconds = sum(len(rate) * dt for _, rate, _, dt in filtered)
+    seconds = sum(len(rate) * dt for _, rate, dt in filtered)
     return RateLoop(delay, lag, integral, unexplained, seconds)
 
 
@@ -80,29 +81,25 @@ def rate_loop_sensitivity(flight: Flight, loop: RateLoop) -> tuple[np.ndarray, f
 
     Newey-West over `groundstation.identify.fitting.HAC_LAG` s, for the residual of rates is far from white.
     """
-    from scipy import signal
-
     from trueflight.groundstation.identify.fitting import HAC_LAG, bartlett_sum, critical_value
 
     bread, meat, seconds = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
     x = np.array([loop.lag, loop.delay, loop.integral])
     steps = np.array([1e-3, 1e-3, 0.05])
     for command, rate, dt in _pieces([flight]):
-        sos = signal.butter(2, min(BANDWIDTH, 0.4 / dt), fs=1.0 / dt, output="sos")
         skip, thin = int(0.5 / dt), max(1, int(0.1 / (BANDWIDTH * dt)))
 
         def seen(
             x: np.ndarray,
             command: np.ndarray = command,
             dt: float = dt,
-            sos: np.ndarray = sos,
             rows: slice = slice(skip, None, thin),
         ) -> np.ndarray:
-            return np.asarray(signal.sosfiltfilt(sos, respond(command, dt, x[1], x[0], x[2]), axis=0))[rows]
+            return _smooth(respond(command, dt, x[1], x[0], x[2]), dt)[rows]
 
         here = seen(x)
         jacobian = np.stack([(seen(x + h) - here) / h.sum() for h in np.diag(steps)], axis=2)
-        residual = signal.sosfiltfilt(sos, rate, axis=0)[skip::thin] - here
+        residual = _smooth(rate, dt)[skip::thin] - here
         bread += np.einsum("kap,kaq->pq", jacobian, jacobian)
         scores = np.einsum("kap,ka->kp", jacobian, residual)
         meat += bartlett_sum(scores, max(1, round(HAC_LAG / (thin * dt))))
@@ -111,17 +108,38 @@ def rate_loop_sensitivity(flight: Flight, loop: RateLoop) -> tuple[np.ndarray, f
     return inverse @ meat @ inverse, critical_value(seconds)
 
 
-def respond(command: np.ndarray, dt: float, delay: float, lag: float, integral: float) -> np.ndarray:
-    """Body rates (N, k) of the rate loop at rest under commanded rates (N, k), held between samples of `dt` s."""
-    from scipy import signal
+def _smooth(rate: np.ndarray, dt: float) -> np.ndarray:
+    """Body rates (N, k) below `BANDWIDTH`, without delay."""
+    return low_pass(rate, min(BANDWIDTH, 0.4 / dt), 1.0 / dt, order=2)
 
-    a = np.array([[-1.0 / lag, 1.0], [-integral / lag, 0.0]])
-    b = np.array([[1.0 / lag], [integral / lag]])
-    a_d, b_d, c, d, _ = signal.cont2discrete((a, b, np.array([[1.0, 0.0]]), np.zeros((1, 1))), dt)
-    numerator, denominator = signal.ss2tf(a_d, b_d, c, d)
+
+def respond(command: np.ndarray, dt: float, delay: float, lag: float, integral: float) -> np.ndarray:
+    """Body rates (N, k) of the rate loop at rest under commanded rates (N, k), held between samples of `dt` s.
+
+    The loop is `(s + integral) / (lag s^2 + s + integral)`; what each sample's command adds is the difference of its
+    step response between two samples.
+    """
     n = np.arange(len(command), dtype=float)
     late = np.stack([np.interp(n - delay / dt, n, column) for column in command.T], axis=1)
-    return np.asarray(signal.lfilter(numerator[0], denominator, late, axis=0))
+    adds = np.diff(_step_response(dt * np.arange(len(command)), lag, integral), prepend=0.0)
+    size = fft.next_fast_len(2 * len(command), real=True)
+    answer = fft.rfft(late, size, axis=0) * fft.rfft(adds, size)[:, None]
+    return np.asarray(fft.irfft(answer, size, axis=0)[: len(command)])
+
+
+def _step_response(t: np.ndarray, lag: float, integral: float) -> np.ndarray:
+    """The rate loop's answer (N,) at times `t` in s to a rate of one that is commanded from 0 on, by its two poles."""
+    quick = 1.0 / lag
+    apart = np.sqrt(complex(quick**2 - 4.0 * integral * quick))
+    if abs(apart) < 1e-4 * quick:  # a double pole is that of two next to each other
+        apart = complex(1e-4 * quick)
+    first = -0.5 * (quick + apart)
+    second = integral * quick / first  # their product, which their difference would lose
+    out = np.ones(len(t), dtype=complex)
+    for pole, other in ((first, second), (second, first)):
+        if pole != 0.0:
+            out += quick * (pole + integral) / (pole * (pole - other)) * np.exp(pole * t)
+    return np.asarray(out.real)
 
 
 def actuation_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:

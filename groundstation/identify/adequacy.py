@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from trueflight.groundstation.identify.spectrum import own_period
 from trueflight.groundstation.measured.bins import bins
@@ -157,6 +157,8 @@ def _line(m: Measurement, column: np.ndarray, s: Spectrum, beyond: float) -> tup
 
 def _course(m: Measurement, column: np.ndarray, f: float) -> str:
     """Whether a line swells and dies away over the flight."""
+    from scipy import signal  # dear to load, and few flights have a line
+
     period = float(np.median(np.diff(m.t)))
     placed = np.zeros(len(m.t))
     placed[m.used] = column

@@ -10,8 +10,9 @@ against its own neighbourhood in the same way.
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage, signal, special
+from scipy import ndimage, special
 
+from trueflight.groundstation.measured.low_pass import hann
 from trueflight.groundstation.measured.measurement import Measurement
 from trueflight.groundstation.results import SpectralLine
 from trueflight.models.flight import Flight
@@ -74,10 +75,7 @@ def _lines(
     power, floor = spectra.mean(axis=0), noise.mean(axis=0)
     found = []
     for column, axis in enumerate(axes):
-        peaks, _ = signal.find_peaks(
-            np.where(inside, ratio[:, column], 0.0), distance=max(1, round(1.0 / step))
-        )
-        for peak in peaks:
+        for peak in peaks(np.where(inside, ratio[:, column], 0.0), max(1, round(1.0 / step))):
             # a segment's window spreads a line over three bins
             around = slice(max(peak - 2, 0), peak + 3)
             excess = np.maximum(power[around, column] - floor[around, column], 0.0)
@@ -97,7 +95,7 @@ def _slow_lines(
     found = []
     for column, axis in enumerate(axes):
         ratio = np.where(inside, power[:, column] / _neighbours(frequency, power[:, column]), 0.0)
-        for peak in signal.find_peaks(ratio, distance=PERIODS)[0]:
+        for peak in peaks(ratio, PERIODS):
             p = float(np.exp(-ratio[peak])) * int(inside.sum()) * len(axes)
             # the window spreads a line over three frequencies
             around = slice(max(peak - 2, 0), peak + 3)
@@ -108,9 +106,19 @@ def _slow_lines(
     return found
 
 
+def peaks(values: np.ndarray, distance: int) -> list[int]:
+    """Where `values` (F,) are greater than on both sides, and than all others so near that are."""
+    tops = np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] > values[2:])) + 1
+    kept: list[int] = []
+    for top in tops[np.argsort(-values[tops], kind="stable")]:
+        if all(abs(int(top) - other) >= distance for other in kept):
+            kept.append(int(top))
+    return sorted(kept)
+
+
 def _whole(columns: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (F,) and mean square by frequency (F, A) of a flight as a whole, Hann window."""
-    window = signal.windows.hann(len(columns), sym=False)
+    window = hann(len(columns))
     power = np.abs(np.fft.rfft((columns - columns.mean(axis=0)) * window[:, None], axis=0)) ** 2
     scale = 2.0 / (len(columns) * np.sum(window**2))
     return np.fft.rfftfreq(len(columns), period), scale * power
@@ -147,7 +155,7 @@ def own_period(flight: Flight, frequency: float) -> bool:
 def _spectra(columns: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Frequencies (F,), power densities (S, F, A) of segments, and how many independent segments they are worth."""
     length = round(SEGMENT / period)
-    window = signal.windows.hann(length, sym=False)
+    window = hann(length)
     scale = 2.0 * period / np.sum(window**2)
     good = np.all(np.isfinite(columns), axis=1).astype(int)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good, [0]])))

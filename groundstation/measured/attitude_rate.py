@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import signal
 
+from trueflight.groundstation.measured.low_pass import density
 from trueflight.models.flight import Flight
 
 ORDER = 3
@@ -68,6 +68,8 @@ def rate_from_attitude(
 
 def _slope(quaternion: np.ndarray, half: int, dt: float) -> np.ndarray:
     """Slope (N, 3), rad/s, of a polynomial through the attitudes up to `half` samples away; ends hold."""
+    from scipy import signal  # dear to load, and most flights have a gyroscope
+
     taps = signal.savgol_coeffs(2 * half + 1, min(ORDER, 2 * half), deriv=1, delta=dt, use="dot")
     n = len(quaternion)
     slope = np.zeros((n, 3))
@@ -82,7 +84,7 @@ def _slope(quaternion: np.ndarray, half: int, dt: float) -> np.ndarray:
 def _band(rough: np.ndarray, fs: float, bandwidth: float) -> float:
     """Hz up to which the attitude moves by more than its noise, at most `bandwidth`; the noise is that of the upper end
     of its spectrum, where nothing turns a vehicle."""
-    frequency, power = signal.welch(rough, fs=fs, nperseg=min(len(rough), round(4.0 * fs)), axis=0)
+    frequency, power = density(rough, fs, min(len(rough), round(4.0 * fs)))
     with np.errstate(divide="ignore", invalid="ignore"):
         # a rate's spectrum over that of a difference of white noise: the attitude's own
         attitude = power / (np.sin(2.0 * np.pi * frequency / fs) * fs)[:, None] ** 2

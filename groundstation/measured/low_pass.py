@@ -21,15 +21,17 @@ NOTHING = 1e-13
 """Columns that are no larger than this are rounding errors of zero, whatever their unit is."""
 
 
-def gain(frequency: np.ndarray, bandwidth: float, fs: float) -> np.ndarray:
-    """Factor of the filter at each `frequency` (F,) in Hz, sampled at `fs` Hz: that of a Butterworth filter of fourth
-    order, designed by the bilinear transform, forward and backward."""
+def gain(frequency: np.ndarray, bandwidth: float, fs: float, order: int = ORDER) -> np.ndarray:
+    """Factor of the filter at each `frequency` (F,) in Hz, sampled at `fs` Hz: that of a Butterworth filter of an
+    `order`, designed by the bilinear transform, forward and backward."""
     with np.errstate(over="ignore"):
         ratio = np.tan(np.pi * np.minimum(frequency / fs, 0.5)) / np.tan(np.pi * bandwidth / fs)
-        return np.asarray(1.0 / (1.0 + ratio ** (2 * ORDER)))
+        return np.asarray(1.0 / (1.0 + ratio ** (2 * order)))
 
 
-def low_pass(columns: np.ndarray, bandwidth: float, fs: float, every: int = 1) -> np.ndarray:
+def low_pass(
+    columns: np.ndarray, bandwidth: float, fs: float, every: int = 1, order: int = ORDER
+) -> np.ndarray:
     """Columns (N, k) sampled at `fs` Hz behind the filter of `bandwidth` Hz, every so many rows of them.
 
     Both ends are continued by a second of their mirror image, turned about the end, and then held.
@@ -50,20 +52,25 @@ def low_pass(columns: np.ndarray, bandwidth: float, fs: float, every: int = 1) -
     wide[:, first + n : first + n + pad] = 2.0 * x[:, -1:] - x[:, -2 : -pad - 2 : -1]
     wide[:, :hold] = wide[:, hold : hold + 1]
     wide[:, first + n + pad :] = wide[:, first + n + pad - 1 : first + n + pad]
-    turned = fft.rfft(wide, overwrite_x=True) * _gain(size, bandwidth, fs)
+    turned = fft.rfft(wide, overwrite_x=True) * _gain(size, bandwidth, fs, order)
     out[loud] = fft.irfft(turned, size, overwrite_x=True)[:, first : first + n : every]
     return out.T
 
 
 @lru_cache(maxsize=64)
-def _gain(size: int, bandwidth: float, fs: float) -> np.ndarray:
-    return gain(fft.rfftfreq(size, 1.0 / fs), bandwidth, fs)
+def _gain(size: int, bandwidth: float, fs: float, order: int) -> np.ndarray:
+    return gain(fft.rfftfreq(size, 1.0 / fs), bandwidth, fs, order)
+
+
+def hann(length: int) -> np.ndarray:
+    """A periodic Hann window (length,)."""
+    return np.asarray(0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length))
 
 
 def density(columns: np.ndarray, fs: float, length: int) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (F,) in Hz and power density (F, k) of columns (N, k): the mean over Hann windows of `length` rows
     that overlap by half (Welch, IEEE Trans. Audio Electroacoust. 15, 1967)."""
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
+    window = hann(length)
     step = length - length // 2
     total = np.zeros((length // 2 + 1, columns.shape[1]))
     starts = range(0, len(columns) - length + 1, step)

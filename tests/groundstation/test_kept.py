@@ -10,7 +10,9 @@ import pytest
 from scipy import signal
 from simulated import simulated
 
+from trueflight.groundstation.identify.actuation import respond
 from trueflight.groundstation.identify.fitting import MeasuredFlights
+from trueflight.groundstation.identify.spectrum import peaks
 from trueflight.groundstation.measured.low_pass import density, gain, low_pass
 from trueflight.groundstation.measured.measurement import measure
 from trueflight.models.effect import Motion, Stage
@@ -88,3 +90,22 @@ def test_density_is_that_of_welch(length: int) -> None:
     mine = density(columns, 50.0, length)
     np.testing.assert_allclose(mine[0], frequency)
     np.testing.assert_allclose(mine[1], theirs, rtol=1e-9)
+
+
+def test_peaks_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        values, distance = np.maximum(rng.normal(size=200), 0.0), int(rng.integers(1, 20))
+        assert peaks(values, distance) == list(signal.find_peaks(values, distance=distance)[0])
+
+
+@pytest.mark.parametrize(
+    ("lag", "integral"), [(0.05, 0.0), (0.05, 1e-6), (0.05, 2.0), (0.05, 5.0), (0.4, 3.0)]
+)
+def test_answer_of_the_loop_is_that_of_its_difference_equation(lag: float, integral: float) -> None:
+    command = np.random.default_rng(0).normal(size=(2000, 2))
+    state, held = np.array([[-1.0 / lag, 1.0], [-integral / lag, 0.0]]), np.array([[1.0], [integral]]) / lag
+    a, b, c, d, _ = signal.cont2discrete((state, held, np.array([[1.0, 0.0]]), np.zeros((1, 1))), 0.01)
+    numerator, denominator = signal.ss2tf(a, b, c, d)
+    theirs = signal.lfilter(numerator[0], denominator, command, axis=0)
+    np.testing.assert_allclose(respond(command, 0.01, 0.0, lag, integral), theirs, atol=1e-7)
