@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from trueflight.models.airframe import Airframe
 from trueflight.models.array import ABSENT, Array
 from trueflight.models.flight import Flight
 from trueflight.models.vehicle import GRAVITY, Vehicle
@@ -171,6 +172,9 @@ class Effect:
     `truth_for` gives the true values of the parameters by the simulator's numbers and the neutral values, where a
     parameter's own `truth` is not enough; `carrier_truth` is the simulator's number for every parameter of the first of
     `acts_through`, where none of these is hidden with it.
+
+    For other simulators and autopilots: `on_airframe` puts the parameters into the numbers that they have
+    (`models.airframe`); None where they have none.
     """
 
     name: str
@@ -202,6 +206,7 @@ class Effect:
     shown_in: str = ""
     truth_for: Callable[[Mapping[str, float], Mapping[str, float]], Mapping[str, float]] | None = None
     carrier_truth: str = ""
+    on_airframe: Callable[[Airframe, Mapping[str, float]], Airframe] | None = None
 
     def apply(self, motion: Motion, values: Mapping[str, Any]) -> Motion:
         """The motion with this effect acting; `values` by parameter name."""

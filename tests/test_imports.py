@@ -17,7 +17,7 @@ ALLOWED = {
     "groundstation": {
         "trueflight.groundstation", "torch", "control", "scipy", "rerun", "pyarrow", "pyulog", "pymavlink", "rosbags",
         "onnx", "onnxruntime", "mcap", "mcap_ros2", "zstandard", "google", "zenoh", "jinja2", "markupsafe",
-        "matplotlib", "pandas", "dask", "distributed", "cryptography", "threadpoolctl",
+        "matplotlib", "pandas", "dask", "distributed", "cryptography", "threadpoolctl", "sympy",
     },
     "sim_bridge": {
         "trueflight.sim_bridge", "trueflight.companion", "mujoco", "pymavlink", "scipy", "mcap", "google",
@@ -40,6 +40,7 @@ ROOMS: dict[str, set[str]] = {
     "measured": set(),
     "design": set(),
     "operate": set(),
+    "export": set(),
     "identify": {"results", "reading", "measured", "design"},
     "evaluate": {"results", "reading", "measured", "design", "identify"},
     "learn": {"measured", "identify", "evaluate"},
@@ -52,11 +53,11 @@ ROOMS: dict[str, set[str]] = {
     },
     "library": {
         "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",
-        "report",
+        "report", "export",
     },
     "commands": {
         "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",
-        "views", "report", "study",
+        "views", "report", "study", "export",
     },
 }  # fmt: skip
 """The rooms of groundstation/ from the bottom to the top, and what each may import: only what stands above it here."""

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from trueflight.groundstation.commands.elsewhere import ONNX, chosen, export_elsewhere, only_vehicle
 from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
     BandwidthOption,
@@ -192,7 +193,7 @@ def model_show(
     from trueflight.groundstation.output.tables import print_model
     from trueflight.groundstation.versions.store import find
 
-    model = find(store, vehicle or _only_vehicle(store), which)
+    model = find(store, vehicle or only_vehicle(store), which)
     if as_json:
         print_json(model_table(model))
         return
@@ -201,25 +202,61 @@ def model_show(
 
 @model_app.command("export")
 def model_export(
-    which: Annotated[str, typer.Argument(help="Version number, or the model's JSON file.")],
-    flight: Annotated[
-        list[Path],
-        typer.Option(
-            "--flight", help="Flight that gives training range, golden vectors and actuation. Repeatable."
-        ),
+    which: Annotated[
+        str,
+        typer.Argument(help="Version number, or the model's JSON file; 'linear': the vehicle file alone."),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The ONNX file to write.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The file to write.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="onnx, for the companion; or mujoco, rotorpy, crazyflow, gazebo, px4, px4-sih, casadi, sympy."
+        ),
+    ] = ONNX,
+    flight: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--flight", help="For onnx: gives training range, golden vectors and actuation. Repeatable."
+        ),
+    ] = None,
     vehicle: VehicleOption = None,
     mapping: MappingOption = None,
     store: StoreOption = DEFAULT_STORE,
+    name: Annotated[
+        str, typer.Option("--vehicle-name", help="Name of the vehicle, for a version number.")
+    ] = "",
+    hover_speed: Annotated[
+        float | None, typer.Option(help="Speed of the rotors in a hover, rad/s; not for onnx.")
+    ] = None,
+    torque_length: Annotated[
+        float | None, typer.Option(help="Drag torque of a rotor over its thrust, m; not for onnx.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a version as one ONNX file with its contract, ready to deploy.
+    """Write a version as one file: for the companion, or for another simulator, autopilot or solver.
 
-    What the flights show of the rate loop goes with it: the corrected controller looks ahead over it.
+    An ONNX file has its contract and is ready to deploy; what the flights show of the rate loop goes with it: the
+    corrected controller looks ahead over it. Of the others each says of every effect whether it holds it.
 
-    Example: groundstation model export v2 --flight identify.csv -o correction.onnx
+    Examples: groundstation model export v2 --flight identify.csv -o correction.onnx; groundstation model export v2 --to
+    mujoco -o vehicle.xml
     """
+    if to == ONNX:
+        _export_onnx(which, flight or [], output, vehicle, mapping, store, as_json)
+        return
+    model = chosen(to, which, vehicle, name, store)
+    export_elsewhere(console, model, to, output, hover_speed, torque_length, as_json)
+
+
+def _export_onnx(
+    which: str,
+    flight: Sequence[Path],
+    output: Path,
+    vehicle: Path | None,
+    mapping: list[str] | None,
+    store: Path,
+    as_json: bool,
+) -> None:
     from trueflight.groundstation.identify.actuation import actuation_of
     from trueflight.groundstation.reading import read_flight
     from trueflight.groundstation.versions.choice import check_vehicle
@@ -227,6 +264,8 @@ def model_export(
     from trueflight.models.contract import model_hash
     from trueflight.models.export import export_onnx, not_exported
 
+    if not flight:
+        raise InputError("onnx: pass --flight, which gives training range and golden vectors")
     flights = [read_flight(path, vehicle, mapping) for path in flight]
     model = find(store, flights[0].vehicle.name, which)
     for one in flights:
@@ -239,10 +278,13 @@ def model_export(
         print_json(
             {
                 "path": str(output),
+                "to": ONNX,
                 "hash": model_hash(data),
                 "bytes": len(data),
                 "not_exported": list(left),
                 "actuation": actuation,
+                "effects": [],
+                "notes": [],
             }
         )
         return
@@ -266,10 +308,3 @@ def _print_exported(actuation: Mapping[str, float], left: Sequence[str]) -> None
             f"not in it, for a static correction has no memory and no sensor: {', '.join(left)}",
             style="yellow",
         )
-
-
-def _only_vehicle(store: Path) -> str:
-    names = sorted(p.name for p in store.iterdir() if p.is_dir()) if store.is_dir() else []
-    if len(names) != 1:
-        raise InputError(f"{store}: holds {len(names)} vehicles; say which with --vehicle-name")
-    return names[0]

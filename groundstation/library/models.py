@@ -44,6 +44,27 @@ class Model(versions.Model):
         made, _ = save(Path(store), self, parent if parent is not None and parent.version else None)
         return as_model(made)
 
+    def export(
+        self,
+        output: str | Path,
+        to: str,
+        *,
+        hover_speed: float | None = None,
+        torque_length: float | None = None,
+    ) -> dict[str, tuple[str, str]]:
+        """Write this model for another simulator, autopilot or solver: `to` is mujoco, rotorpy, crazyflow, gazebo,
+        px4, px4-sih, casadi or sympy.
+
+        `hover_speed` (rad/s) of the rotors and `torque_length` (m), a rotor's drag torque over its thrust, are a usual
+        propeller's where they are not given. Returns of each effect whether the file holds it (whole, roughly, not),
+        and where or why not. Raises `InputError` where the vehicle lacks what the file needs, or it cannot be written.
+        """
+        from trueflight.groundstation.export.target import Known
+        from trueflight.groundstation.export.targets import export
+
+        written = export(self, to, Path(output), Known(hover_speed, torque_length))
+        return {line.effect: (line.held, line.how) for line in written.lines}
+
     def __repr__(self) -> str:
         values = ", ".join(f"{name} {value:.4g}" for name, value in self.params.items())
         return f"<Model {self.label} of {self.vehicle.name}{': ' if values else ''}{values}>"

@@ -32,4 +32,5 @@ EFFECT = Effect(
     manoeuvre="climbs and descents at 1 to 3 m/s, there and back",
     citation="Leishman, Principles of Helicopter Aerodynamics, ch. 3 (blade element theory); Svacha et al. 2017",
     confounded_with=("parasitic_drag", "motor_lag", "vortex_ring"),
+    on_airframe=lambda airframe, values: airframe.with_(inflow=values["slope"]),
 )

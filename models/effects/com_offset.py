@@ -36,4 +36,5 @@ EFFECT = Effect(
     needs_any=("rotor_speed", "motor_command"),
     exports=False,
     rotational=True,
+    on_airframe=lambda airframe, values: airframe.with_(centre_of_mass=(values["x"], values["y"])),
 )

@@ -44,4 +44,5 @@ EFFECT = Effect(
     confounded_with=("rate_loop_lag",),
     exports=False,
     rotational=True,
+    on_airframe=lambda airframe, values: airframe.with_(spin_inertia=values["inertia"]),
 )

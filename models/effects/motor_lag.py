@@ -38,4 +38,5 @@ EFFECT = Effect(
     confounded_with=("transport_delay",),
     exports=False,
     before_rotors=True,
+    on_airframe=lambda airframe, values: airframe.with_(lag=values["tau"]),
 )

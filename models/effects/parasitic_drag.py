@@ -34,4 +34,5 @@ EFFECT = Effect(
     manoeuvre="translations at two or more speeds, the fastest at 4 m/s or more",
     citation="drag equation; Leishman, Principles of Helicopter Aerodynamics, ch. 6 (parasitic drag of the airframe)",
     confounded_with=("rotor_drag", "wind"),
+    on_airframe=lambda airframe, values: airframe.with_(frame_drag=(values["x"], values["y"], values["z"])),
 )

@@ -47,4 +47,5 @@ EFFECT = Effect(
     confounded_with=("transport_delay", "motor_lag"),
     exports=False,
     rotational=True,
+    on_airframe=lambda airframe, values: airframe.with_(rate_lag=values["lag"], rate_delay=values["delay"]),
 )

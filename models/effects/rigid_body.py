@@ -19,4 +19,5 @@ EFFECT = Effect(
     manoeuvre="any flight with tilt above about ten degrees",
     citation="Newton-Euler equations; Carvalho et al. 2022, eq. (1)-(3)",
     unconfounded="it has no parameter: nothing is fitted",
+    on_airframe=lambda airframe, values: airframe,
 )

@@ -88,4 +88,7 @@ EFFECT = Effect(
     seen_as=("thrust_gain",),
     exclusive=True,
     truth_for=truth,
+    on_airframe=lambda airframe, values: airframe.with_(
+        strength=tuple(1.0 - values[f"loss_{i}"] for i in (1, 2, 3, 4))
+    ),
 )

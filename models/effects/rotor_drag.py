@@ -49,4 +49,5 @@ EFFECT = Effect(
     manoeuvre="translations along body x and along body y at 1 to 4 m/s, there and back",
     citation="Mahony, Kumar, Corke 2012; Faessler, Franchi, Scaramuzza 2018; Kai et al. 2017",
     confounded_with=("parasitic_drag", "wind", "accelerometer_bias"),
+    on_airframe=lambda airframe, values: airframe.with_(hub_drag=(values["x"], values["y"])),
 )

@@ -25,4 +25,5 @@ EFFECT = Effect(
     confounded_with=("thrust_gain", "accelerometer_bias"),
     generalises=("thrust_gain",),
     before_rotors=True,
+    on_airframe=lambda airframe, values: airframe.bent(values["curvature"]),
 )

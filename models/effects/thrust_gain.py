@@ -33,4 +33,5 @@ EFFECT = Effect(
     confounded_with=("thrust_curve", "battery_sag", "accelerometer_bias", "rotor_damage"),
     scales_rotors=True,
     aliases=("mass", "payload", "thrust constant"),
+    on_airframe=lambda airframe, values: airframe.scaled(values["gain"]),
 )

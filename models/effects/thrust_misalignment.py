@@ -29,4 +29,5 @@ EFFECT = Effect(
     confounded_with=("accelerometer_bias", "wind", "rotor_drag"),
     aliases=("mounting of the autopilot",),
     generalises=("accelerometer_bias",),
+    on_airframe=lambda airframe, values: airframe.with_(lean=(values["x"], values["y"])),
 )

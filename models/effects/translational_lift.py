@@ -32,4 +32,5 @@ EFFECT = Effect(
     citation="Svacha, Mohta, Kumar 2017 (ICUAS), thrust model with k_h |v_h|²; Leishman, Principles of Helicopter "
     "Aerodynamics, sec. 3.5 (blade element theory in forward flight, term in the square of the advance ratio)",
     confounded_with=("parasitic_drag", "axial_inflow", "thrust_curve"),
+    on_airframe=lambda airframe, values: airframe.with_(lift=values["lift"]),
 )

@@ -43,4 +43,5 @@ EFFECT = Effect(
     shifts_clock=True,
     before_rotors=True,
     truth_for=truth,
+    on_airframe=lambda airframe, values: airframe.with_(delay=values["delay"]),
 )

@@ -29,4 +29,5 @@ EFFECT = Effect(
     confounded_with=("accelerometer_bias", "rotor_drag", "parasitic_drag"),
     acts_through=("rotor_drag", "parasitic_drag"),
     carrier_truth="drag",
+    on_airframe=lambda airframe, values: airframe.with_(moving_air=(values["x"], values["y"])),
 )

@@ -1,0 +1,1 @@
+"""A model as the files of other simulators, autopilots and solvers. One module each."""
