@@ -5,13 +5,14 @@ World ENU, body FLU, SI units: Gazebo's own. A rotor is a light link that turns 
 `Hydrodynamics`, whose derivatives are below 0 where they brake, and whose current is the wind.
 
 Sources: gz-sim 9, `MulticopterMotorModel::UpdateForcesAndMoments` (motorConstant w², -w rotorDragCoefficient v in the
-rotor's plane, momentConstant times thrust), `Hydrodynamics::PreUpdate` (`xU u + xUabsU |u| u`, and so on for y and z);
-PX4 1.17, `GZMixingInterfaceESC` and `module.yaml` of SIM_GZ (speeds up to 1000 rad/s).
+rotor's plane, momentConstant times thrust), `Hydrodynamics::PreUpdate` (`(xU + xUabsU |u| + xUabsV |v| + ...) u`, and
+so on for y and z); PX4 1.17, `GZMixingInterfaceESC` and `module.yaml` of SIM_GZ (speeds up to 1000 rad/s).
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from trueflight.groundstation.export.target import (
     Written,
     airframe_of,
     header,
+    hover_command,
     lines_of,
     moments,
     rotors_of,
@@ -39,6 +41,10 @@ _FASTEST = 1000.0
 """rad/s, the largest speed that PX4 sends to Gazebo."""
 _SLOWER = 10
 """By so much Gazebo's rotors turn slower than those they stand for, or they would turn too far in a step."""
+_BESIDE = 0.01
+"""Of the weight: a thrust curve that PX4 and Gazebo together give as well as this is held whole."""
+_ACROSS = math.sqrt(2.0) - 1.0
+"""Share of the other axes' speeds in that of one: |u| + share |v| is |v| along an axis and halfway between two."""
 _ROTOR_SHARE = 0.005
 """Of the vehicle's mass, each rotor's link: light, and whole with the base's."""
 
@@ -47,7 +53,9 @@ _HOLDINGS = {
     "lag": Holding("timeConstantUp and timeConstantDown"),
     "hub_drag": Holding("rotorDragCoefficient; what the axes do not share in Hydrodynamics", ROUGHLY),
     "inflow": Holding("Hydrodynamics zW: as in a hover, whatever the rotors' speed", ROUGHLY),
-    "frame_drag": Holding("Hydrodynamics xUabsU, yVabsV, zWabsW: exact along each axis of the body", ROUGHLY),
+    "frame_drag": Holding(
+        "Hydrodynamics: exact along each axis of the body and halfway between two", ROUGHLY
+    ),
     "moving_air": Holding(
         "Hydrodynamics default_current; for the rotors it stands in the world, see the notes", ROUGHLY
     ),
@@ -60,45 +68,51 @@ _HOLDINGS = {
 
 def write(model: Model, known: Known) -> Written:
     """The SDF of a model. Raises `InputError` where its vehicle has no rotors, no inertia, or too little of it."""
-    airframe = airframe_of(model)
+    airframe, vehicle = airframe_of(model), model.vehicle
+    factor, full, off = square_motors(airframe)
     assumed = known.hover_speed is None
     if assumed:  # the scale is free: the one that PX4's largest number stands for full command
-        full = max(airframe.thrust(airframe.top()), model.vehicle.weight)
-        known = Known(_FASTEST / math.sqrt(full / model.vehicle.weight), known.torque_length)
+        known = Known(_FASTEST * math.sqrt(vehicle.weight / full), known.torque_length)
     rotors, notes = rotors_of(airframe, known)
+    rotors = replace(rotors, full_speed=rotors.hover_speed * math.sqrt(full / vehicle.weight))
     if assumed:
         notes = (*notes, f"rotors: {_FASTEST:g} rad/s at full command is PX4's largest number, not measured")
-    notes = (*notes, *_notes(airframe, rotors))
-    lines = lines_of(model, _HOLDINGS, "Gazebo")
+    curve = _HOLDINGS["curve"]
+    if off > _BESIDE:
+        curve = Holding(f"{curve.how}; off by up to {100 * off:.0f} % of the weight near the hover", ROUGHLY)
+    notes = (*notes, *_notes(airframe, rotors, factor))
+    lines = lines_of(model, {**_HOLDINGS, "curve": curve}, "Gazebo")
     return Written(_sdf(airframe, rotors, header(model, lines, notes)), lines, notes)
 
 
-def square_motor_factor(airframe: Airframe) -> tuple[float, float]:
-    """THR_MDL_FAC for rotors whose speed goes with the motor signal, so that a command gives the airframe's thrust; and
-    by how much of full thrust the two differ at most from a tenth of the command on."""
-    top = airframe.top()
-    command = np.linspace(0.1, 1.0, 46)
-    thrust = np.array([airframe.thrust(min(u, top)) for u in command]) / airframe.thrust(top)
-    best, least = 1.0, math.inf
+def square_motors(airframe: Airframe) -> tuple[float, float, float]:
+    """THR_MDL_FAC and full thrust (N) for rotors whose speed goes with the motor signal, so that a command gives the
+    airframe's thrust; and by how much of the weight the two differ at most, between half and one and a half times the
+    hover's command."""
+    hover = hover_command(airframe)
+    command = np.linspace(0.5 * hover, min(1.5 * hover, airframe.top()), 51)
+    thrust = np.array([airframe.thrust(u) for u in command])
+    best = (1.0, float(thrust[-1]), math.inf)
     for factor in np.linspace(0.0, 1.0, 201):
-        # the signal x that PX4 makes of a command: f x² + (1 - f) x = command
-        rest = 1.0 - factor
-        signal = (
-            command
-            if factor == 0.0
-            else (np.sqrt(rest * rest + 4.0 * factor * command) - rest) / (2.0 * factor)
-        )
-        worst = float(np.max(np.abs(signal**2 - thrust)))
-        if worst < least:
-            best, least = float(factor), worst
-    return best, least
+        square = motor_signal(command, float(factor)) ** 2
+        full = float(np.sum(thrust * square) / np.sum(square**2))
+        worst = float(np.max(np.abs(full * square - thrust))) / airframe.vehicle.weight
+        if worst < best[2]:
+            best = (float(factor), full, worst)
+    return best
 
 
-def _notes(airframe: Airframe, rotors: Rotors) -> tuple[str, ...]:
-    factor, off = square_motor_factor(airframe)
-    near = "" if off < 0.01 else f", which misses the model's curve by up to {100 * off:.0f} % of full thrust"
+def motor_signal(command: np.ndarray, factor: float) -> np.ndarray:
+    """The signal x that PX4 makes of a command: `factor x² + (1 - factor) x = command`."""
+    if factor == 0.0:
+        return command
+    rest = 1.0 - factor
+    return np.asarray((np.sqrt(rest * rest + 4.0 * factor * command) - rest) / (2.0 * factor))
+
+
+def _notes(airframe: Airframe, rotors: Rotors, factor: float) -> tuple[str, ...]:
     notes = [
-        f"PX4: SIM_GZ_EC_MIN* 0, SIM_GZ_EC_MAX* {rotors.full_speed:.0f}, THR_MDL_FAC {factor:.3g}{near}",
+        f"PX4: SIM_GZ_EC_MIN* 0, SIM_GZ_EC_MAX* {rotors.full_speed:.0f}, THR_MDL_FAC {factor:.3g}",
         f"the rotors weigh {100 * _ROTOR_SHARE:g} % of the vehicle each, which the base is lighter by",
     ]
     if rotors.full_speed > _FASTEST + 0.5:
@@ -232,7 +246,9 @@ def _drag(airframe: Airframe) -> str:
     names = ("xU", "yV", "zW")
     terms = [(name, -mass * drag) for name, drag in zip(names, linear, strict=True)]
     terms += [
-        (f"{name}abs{name[1]}", -mass * drag) for name, drag in zip(names, airframe.frame_drag, strict=True)
+        (f"{name}abs{other[1]}", -mass * drag * (1.0 if other == name else _ACROSS))
+        for name, drag in zip(names, airframe.frame_drag, strict=True)
+        for other in names
     ]
     rows = "".join(f"      <{name}>{value:.9g}</{name}>\n" for name, value in terms if value)
     return f"""    <plugin filename="gz-sim-hydrodynamics-system" name="gz::sim::systems::Hydrodynamics">

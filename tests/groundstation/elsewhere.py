@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from trueflight.groundstation.export.gazebo_sdf import square_motor_factor
+from trueflight.groundstation.export.gazebo_sdf import motor_signal, square_motors
 from trueflight.groundstation.export.target import Known, airframe_of
 from trueflight.groundstation.export.targets import TARGETS
 from trueflight.groundstation.identify.translation import diagnose
@@ -215,23 +215,23 @@ class GazeboFormulas(Rigid):
         self.inertia = np.array([number(base, f"inertial/inertia/{i}") for i in ("ixx", "iyy", "izz")])
         for x, y, z in self.hubs:
             self.inertia += own + light * np.array([y * y + z * z, z * z + x * x, x * x + y * y])
-        self.linear, self.quadratic = np.zeros(3), np.zeros(3)
+        self.linear, self.quadratic = np.zeros(3), np.zeros((3, 3))
         for plugin in water:
             self.wind = triple(plugin, "default_current")
             self.linear = np.array([number(plugin, name, 0.0) for name in ("xU", "yV", "zW")])
-            self.quadratic = np.array([number(plugin, n, 0.0) for n in ("xUabsU", "yVabsV", "zWabsW")])
+            self.quadratic = np.array(
+                [[number(plugin, f"{n}abs{k}", 0.0) for k in "UVW"] for n in ("xU", "yV", "zW")]
+            )
 
     def target(self, commands: np.ndarray) -> np.ndarray:
-        f, rest = self.factor, 1.0 - self.factor
-        signal = (np.sqrt(rest * rest + 4.0 * f * commands) - rest) / (2.0 * f)
-        return signal * self.fastest
+        return motor_signal(commands, self.factor) * self.fastest
 
     def wrench(self, drive: np.ndarray, air: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         thrust = self.constants * drive**2
         local = air + np.cross(rates, self.hubs)
         hubs = -(drive * self.drags)[:, None] * (local * (1.0 - UP))
         hubs[:, 2] += thrust
-        frame = (self.linear + self.quadratic * np.abs(air)) * air
+        frame = (self.linear + self.quadratic @ np.abs(air)) * air
         yaw = -float(np.sum(self.turns * thrust * self.moments))
         return hubs.sum(axis=0) + frame, np.cross(self.hubs, hubs).sum(axis=0) + yaw * UP
 
@@ -381,13 +381,19 @@ def missing(flight: Flight, model: Model) -> list[str]:
     return [effect.name for effect in diagnose(flight, model).effects if effect.verdict == "missing"]
 
 
+def held(model: Model, to: str) -> Model:
+    """What of a model a target says that it holds, whole or roughly."""
+    lines = {line.effect: line.held for line in TARGETS[to].write(model, Known()).lines}
+    return model.with_terms(tuple(term for term in model.terms if lines[term.effect] != "not"))
+
+
 def formulas(model: Model, to: str, folder: Path) -> Rigid:
     """The formulas of a simulator with the file that is written for it."""
     path = folder / f"vehicle{TARGETS[to].ending}"
     path.write_text(TARGETS[to].write(model, Known()).text)
     if to == "gazebo":
         airframe = airframe_of(model)
-        plant = GazeboFormulas(path.read_text(), square_motor_factor(airframe)[0])
+        plant = GazeboFormulas(path.read_text(), square_motors(airframe)[0])
         plant.wind = np.array([*airframe.moving_air, 0.0])  # of the world, as the notes say
         return plant
     if to == "px4-sih":

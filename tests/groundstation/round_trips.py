@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("targets", nargs="*", default=FORMULAS)
     parser.add_argument("--itself", action="store_true")
     asked = parser.parse_args()
-    print("| flown in | found before export | found there after | missing there, with the model |")  # noqa: T201
+    print("| flown in | found here, of what the file holds | fitted there | missing there |")  # noqa: T201
     print("|---|---|---|---|")  # noqa: T201
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -46,8 +46,9 @@ def main() -> None:
             for to in asked.targets:
                 made = elsewhere.itself if asked.itself or to == "mujoco" else elsewhere.formulas
                 there = elsewhere.flown(folder / f"{to}{number}.mcap", 2, plant=made(model, to, folder))
-                left = ", ".join(elsewhere.missing(there, model)) or "nothing"
-                row = (to + " itself" * asked.itself, told(model), told(refit(model, [there])), left)
+                carried = elsewhere.held(model, to)
+                left = ", ".join(elsewhere.missing(there, carried)) or "nothing"
+                row = (to + " itself" * asked.itself, told(carried), told(refit(carried, [there])), left)
                 print("| " + " | ".join(row) + " |", flush=True)  # noqa: T201
 
 

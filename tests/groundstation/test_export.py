@@ -14,7 +14,7 @@ import sympy
 from programs import run
 
 from trueflight.groundstation.export.equations import equations
-from trueflight.groundstation.export.gazebo_sdf import square_motor_factor
+from trueflight.groundstation.export.gazebo_sdf import square_motors
 from trueflight.groundstation.export.px4_params import thrust_model_factor
 from trueflight.groundstation.export.target import Known, Written, airframe_of
 from trueflight.groundstation.export.targets import TARGETS, export
@@ -196,8 +196,8 @@ def test_a_thrust_curve_that_px4_cannot_bend_says_by_how_much_it_differs() -> No
     straight, square = (airframe_of(model_with()).with_(curve=curve) for curve in ((20.0,), (0.0, 20.0)))
     assert thrust_model_factor(square) == pytest.approx((1.0, 0.0), abs=1e-9)
     assert thrust_model_factor(straight) == pytest.approx((0.0, 0.0), abs=1e-9)
-    assert square_motor_factor(straight) == pytest.approx((1.0, 0.0), abs=1e-9)
-    assert square_motor_factor(square) == pytest.approx((0.0, 0.0), abs=1e-9)
+    assert square_motors(straight) == pytest.approx((1.0, 20.0, 0.0), abs=1e-9)
+    assert square_motors(square) == pytest.approx((0.0, 20.0, 0.0), abs=1e-9)
     falling = written(model_with({"thrust_curve": {"curvature": -0.5}}), "px4")
     assert falling.lines[-1].held == "roughly" and "%" in falling.lines[-1].how
     assert any("falls beyond a command" in note for note in falling.notes)
