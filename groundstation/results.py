@@ -8,6 +8,7 @@ import numpy as np
 
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model
+from trueflight.models.vehicle import GRAVITY
 
 RISES = 1.005
 """Times the residual before from which one is said to rise."""
@@ -577,10 +578,15 @@ class Diagnosis:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What has to be said of a residual that rises with what was found."""
+        """What has to be said of a residual that rises with what was found, or that no vehicle has."""
         said: list[str] = []
+        if self.rms_before > GRAVITY:
+            said.append(
+                f"the model is wrong by {self.rms_before:.0f} m/s², more than the weight: that is no effect; compare "
+                "mass, hover_thrust and the unit of the thrust with the vehicle, and cut off what was not flown"
+            )
         if not any(e.rank for e in self.effects):
-            return ()
+            return tuple(said)
         if self.rms_after > RISES * self.rms_before:
             said.append(
                 "the residual rises with what was found: an effect seen in the rotation does not show in the "

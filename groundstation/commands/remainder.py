@@ -70,7 +70,10 @@ def remainder_command(
         if left.formula is None:
             raise InputError(
                 f"{read.name}: no short formula holds what is left; "
-                + (left.advice or "nothing but noise is left of this flight")
+                + (
+                    left.advice
+                    or f"{result.rms_after:.3f} m/s² are left, over a noise floor of {result.noise_floor:.3f}"
+                )
             )
         source = effect_source(left.formula, name, read.name, read.data_hash)
         path = write_effect_file(name, source, write)
@@ -78,6 +81,10 @@ def remainder_command(
         print_json(remainder_table(result, path))
         return
     _print(left, result, path, flight)
+
+
+ABOVE_NOISE = 1.25
+"""Times the noise up to which what is left may be noise alone: the noise is known to about a quarter."""
 
 
 def _print(left: Unexplained, d: Diagnosis, path: Path | None, flight: Path) -> None:
@@ -92,7 +99,15 @@ def _print(left: Unexplained, d: Diagnosis, path: Path | None, flight: Path) -> 
         highlight=False,
     )
     if not left.verdict:
-        console.print("nothing in it can be predicted", style="bold green")
+        beyond = d.rms_after > ABOVE_NOISE * d.noise_floor
+        told = (
+            f"{d.rms_after / d.noise_floor:.1f} times the noise, and "
+            if beyond and d.noise_floor > 0.0
+            else ""
+        )
+        console.print(
+            f"{told}nothing in it can be predicted", style="bold yellow" if beyond else "bold green"
+        )
     else:
         console.print(
             f"none of these explains the rest: {percent(left.variance_share)} of it can be predicted on held-out parts "

@@ -40,7 +40,8 @@ def compare(
     residual = measured - predicted
     used = measurement.used & np.isfinite(residual[:, measurement.axes[-1]])
     mse, mse_linear = (np.mean(r[used] ** 2, axis=0) for r in (residual, measured - linear))
-    floor = heading_noise(measurement)
+    # noise cannot leave more than what is left: a vibration is stronger beyond the pass band than in it
+    floor = np.minimum(heading_noise(measurement, motion), np.sqrt(mse))
     axes = tuple(
         AxisError(
             "xyz"[i], float(np.sqrt(mse[i])), float(floor[i]), _share(mse[i], mse_linear[i], floor[i] ** 2)
@@ -88,10 +89,12 @@ def heading_acceleration(motion: Motion, force: np.ndarray) -> np.ndarray:
     return np.einsum("nij,nj->ni", motion.rotation, force) - [0.0, 0.0, GRAVITY]
 
 
-def heading_noise(measurement: Measurement) -> np.ndarray:
-    """Noise RMS (3,), heading frame: yaw leaves x and y of the body in their plane, tilt is small on average."""
-    plane = np.sqrt(np.mean(measurement.noise[:2] ** 2))
-    return np.array([plane, plane, measurement.noise[2]])
+def heading_noise(measurement: Measurement, motion: Motion) -> np.ndarray:
+    """Noise RMS (3,), heading frame, of each axis by itself: that of the body's axes, turned by roll and pitch."""
+    if motion.rotation is None:
+        return measurement.noise
+    turned = np.asarray(motion.rotation)[measurement.rows][measurement.used] ** 2
+    return np.asarray(np.sqrt(np.einsum("nij,j->i", turned, measurement.noise**2) / max(len(turned), 1)))
 
 
 def _share(mse: float, mse_linear: float, floor: float) -> float:

@@ -31,6 +31,8 @@ MASTERED = 0.5
 discrepancy may be made of it."""
 HALF_TRUSTED = 0.5
 """Variation at which an effect is as often right as wrong."""
+LEAST_TRUST = 0.05
+"""Trust that is left however much varies: no study says less than one in twenty."""
 PARTS = 8
 """Parts of a flight in which an effect is to have the same size."""
 ALPHA = 0.01
@@ -75,7 +77,7 @@ class Weighed:
         with frequency or the scale of thrust. That parts of the flight differ speaks against its constancy alone."""
         worst = max(self.moved, self.shared)
         doubt = max(worst / HALF_TRUSTED, np.sqrt(self.beside) / (1.5 * MASTERED))
-        return float(1.0 / (1.0 + doubt**3)) if self.p_value < CHANCE else 0.5
+        return max(float(1.0 / (1.0 + doubt**3)), LEAST_TRUST) if self.p_value < CHANCE else 0.5
 
     @property
     def told(self) -> str:

@@ -6,13 +6,13 @@ with each, and how sure it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
 
-from trueflight.groundstation.identify.doubt import Weighing
+from trueflight.groundstation.identify.doubt import Weighed, Weighing
 from trueflight.groundstation.identify.fitting import Fit, variance_per_independent_sample
 from trueflight.groundstation.identify.order import answers
 from trueflight.groundstation.identify.search import Choice, Search, State
@@ -72,7 +72,7 @@ def judge(
                 rank,
                 float(np.clip(share, 0.0, 1.0)),
                 figures.wald(effect.name),
-                estimates(figures, effect.name),
+                _either(estimates(figures, effect.name), figures, effect.name, weighed),
                 (*same, *effect.aliases, *also(effect.name)),
                 _add(effect) if sure else _tell(same, effect),
                 scale.seen_in,
@@ -86,7 +86,9 @@ def judge(
     doubtful = doubt is not None or scale.seen_in == "rotation"
     absent = dict.fromkeys(c.effect for c in search.problem.choices if c.effect not in current.names)
     stood_for = {n: [c.effect for c, same in rivals.items() if n in same] for n in absent}
-    return found, [_absent(search, current, scale, n, stood_for[n], doubtful) for n in absent]
+    looked = [_absent(search, current, scale, n, stood_for[n], doubtful) for n in absent]
+    found = [_over(v, fits) for v, fits in ((v, _left_open(search, current, rivals, v.name)) for v in found)]
+    return found, _sharing([v for v, _ in looked], [change for _, change in looked])
 
 
 def _answered(seconds: float) -> str:
@@ -94,6 +96,76 @@ def _answered(seconds: float) -> str:
         f"it comes {seconds:.2g} s after what it is to explain: the commands answer the motion there, as a controller "
         "answers a gust; a flight that is led through the same tells"
     )
+
+
+def _either(
+    told: tuple[ParameterEstimate, ...], figures: Fit, name: str, weighed: Weighed | None
+) -> tuple[ParameterEstimate, ...]:
+    """Estimates whose intervals hold what the weighted estimate says, too, where more is left than noise."""
+    if weighed is None:
+        return told
+    other = {}
+    for i, size, spread in zip(figures.sizes(name), weighed.size, weighed.spread, strict=True):
+        middle, half = figures.free[i].neutral + size, figures.critical * spread
+        other[i] = (middle - half, middle + half)
+    seen = [i for i in figures.of(name) if np.any(figures.jacobian[:, :, i])]
+    return tuple(
+        replace(p, low=min(p.low, other[i][0]), high=max(p.high, other[i][1])) if i in other else p
+        for i, p in zip(seen, told, strict=True)
+    )
+
+
+def _left_open(
+    search: Search, current: State, rivals: Mapping[Choice, tuple[str, ...]], name: str
+) -> list[Fit]:
+    """The fits of sets that explain the flight nearly as well and hold the effect."""
+    sets = [s for s in search.near(current) if name in s.names]
+    for choice, same in rivals.items():
+        if choice.effect == name:
+            continue
+        rest = [c for c in current.choices if c != choice]
+        for rival in (c for c in search.problem.choices if c.effect in same):
+            if not search.problem.effects[rival.effect].acts_through:
+                sets.append(search.state((*rest, rival)))
+    return [s.fit for s in sets]
+
+
+def _over(verdict: EffectVerdict, fits: Sequence[Fit]) -> EffectVerdict:
+    """The verdict with intervals that hold those of all `fits`: what is left open counts."""
+    others = [{p.name: p for p in estimates(f, verdict.name)} for f in fits]
+    parameters = tuple(
+        replace(
+            p,
+            low=min([p.low, *(o[p.name].low for o in others if p.name in o)]),
+            high=max([p.high, *(o[p.name].high for o in others if p.name in o)]),
+        )
+        for p in verdict.parameters
+    )
+    return replace(verdict, parameters=parameters) if fits else verdict
+
+
+def _sharing(verdicts: Sequence[EffectVerdict], changes: Sequence[np.ndarray | None]) -> list[EffectVerdict]:
+    """Verdicts in which effects that are minor, and change the same, share the confidence that one of them is there.
+
+    What an approximate law leaves is as small: it has a share as well.
+    """
+    minor = [
+        i
+        for i, v in enumerate(verdicts)
+        if v.verdict == MINOR and v.confidence is not None and changes[i] is not None
+    ]
+    out = list(verdicts)
+    for i in minor:
+        odds = 1.0  # of a law's error
+        for j in minor:
+            a, b = changes[i], changes[j]
+            assert a is not None and b is not None
+            size = float(np.sum(a * a)) * float(np.sum(b * b))
+            alike = float(np.sum(a * b)) ** 2 / max(size, 1e-30)
+            # by the part of the error that each takes away
+            odds += alike * verdicts[j].variance_share / max(verdicts[i].variance_share, 1e-30)
+        out[i] = replace(verdicts[i], confidence=(verdicts[i].confidence or 0.0) / odds)
+    return out
 
 
 def _there(search: Search, with_: Fit, without: Fit) -> float:
@@ -116,7 +188,8 @@ def _somewhere(figures: Fit, name: str) -> bool:
 
 def _absent(
     search: Search, current: State, scale: Scale, name: str, stands_for: Sequence[str], doubtful: bool
-) -> EffectVerdict:
+) -> tuple[EffectVerdict, np.ndarray | None]:
+    """The verdict on an effect that was not found, and what it would change."""
     problem = search.problem
     effect, own = problem.effects[name], [c for c in problem.choices if c.effect == name]
     present, through = {*problem.included, *current.names}, None
@@ -124,7 +197,7 @@ def _absent(
     if effect.acts_through and not present & set(effect.acts_through):
         carriers = [c for n in effect.acts_through for c in problem.choices if c.effect == n]
         if not carriers:
-            return unmeasured(effect, ())
+            return unmeasured(effect, ()), None
         through, carried = carriers[0].effect, (carriers[0],)
         tried = [search.state((*current.choices, carriers[0], c)).fit for c in own]
     else:
@@ -134,14 +207,17 @@ def _absent(
 
     there = _there(search, extended, current.fit)
 
-    def verdict(word: str, figures: Fit, rivals: Sequence[str], advice: str) -> EffectVerdict:
+    def verdict(
+        word: str, figures: Fit, rivals: Sequence[str], advice: str
+    ) -> tuple[EffectVerdict, np.ndarray | None]:
         told = estimates(figures, name)
         sure = {MINOR: there, NOT_SUPPORTED: 1.0 - there}.get(word)
         if name in search.dropped or (doubtful and there > 0.5):
             sure = None  # what is left, or another flight, speaks against what is seen
-        return EffectVerdict(
+        said = EffectVerdict(
             name, word, None, share, p, told, tuple(rivals), advice, scale.seen_in, confidence=sure
         )
+        return said, figures.residual - current.fit.residual
 
     if stands_for:
         # as a stand-in for the effect found, not beside it

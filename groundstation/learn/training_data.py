@@ -166,7 +166,7 @@ def _of_flight(
         names=names,
         features=features[used].astype(np.float32),
         target=target[used].astype(np.float32),
-        noise=heading_noise(measurement),
+        noise=heading_noise(measurement, motion),
         flight=np.full(count, number),
         t=flight.t[used] - flight.t[0],
         block=np.zeros(count, dtype=int),

@@ -13,7 +13,7 @@ from trueflight.groundstation.measured.attitude_rate import that_turns
 from trueflight.groundstation.measured.low_pass import density, gain, low_pass
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
-from trueflight.models.frames import rotate, rotate_inverse
+from trueflight.models.frames import rotate, rotate_inverse, rotation_matrix
 from trueflight.models.prediction import derivative
 from trueflight.models.vehicle import GRAVITY
 
@@ -187,6 +187,9 @@ def measure(flight: Flight, bandwidth: float | None = None, thin: bool = True) -
     every = max(1, round(fs / flight.sensor_rate)) if flight.sensor_rate else 1
     its_own = min(bandwidth, 0.45 * fs / every)
     noise = _noise(raw[::every], used[::every], its_own, fs / every, differentiate)
+    if differentiate:  # along the world's axes, while what is compared is along the body's
+        turned = rotation_matrix(flight.quaternion[used]) ** 2  # type: ignore[index]
+        noise = np.sqrt(np.einsum("nij,i->j", turned, noise**2) / max(len(turned), 1))
     return Measurement(
         flight=flight,
         t=flight.t[rows],
