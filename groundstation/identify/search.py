@@ -375,8 +375,9 @@ class Search:
                 once = len({c.effect for c in chosen}) == size
                 if not once or not all(self._acts(c, present) for c in chosen):
                     continue
-                if set(current.choices) <= {*self.problem.settled, *chosen}:
-                    continue  # what goes beside all that is found has been tried
+                mine = set(current.choices) - {*self.problem.settled}
+                if mine <= {*chosen} and size <= len(mine) + 1:
+                    continue  # one more beside all that is found has been tried
                 at = [*base, *(i for c in chosen for i in own[c])]
                 inner = gram[np.ix_(at, at)]
                 # the prior: columns are of a typical size, which it is two of wide

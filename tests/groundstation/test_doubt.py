@@ -135,6 +135,20 @@ def test_a_curve_that_swallows_a_gain_and_the_ground_is_not_called_missing(tmp_p
     assert {"thrust_gain", "ground_effect"} <= named
 
 
+def test_a_weak_thrust_and_the_ground_that_hide_each_other_are_found_together(tmp_path) -> None:
+    heights = (0.1, 0.6, 0.08, 0.3, 0.08, 0.6, 0.1, 0.2, 0.4)
+    fly(
+        tmp_path / "low.mcap",
+        ("thrust_gain:0.9", "ground_effect:1.8"),
+        24,
+        through(*[(0, 0, z) for z in heights]),
+    )
+    found = said_of(read_flight(tmp_path / "low.mcap"))
+    assert {*found.named("missing")} == {"thrust_gain", "ground_effect"}
+    (gain,) = (e.parameters[0] for e in found.effects if e.name == "thrust_gain")
+    assert gain.value == pytest.approx(0.9, abs=0.02)
+
+
 def test_a_noisy_gyroscope_does_not_make_the_lever_arm_smaller() -> None:
     flight = simulated(4, "imu_lever_arm")
     (hidden,) = choose(["imu_lever_arm"], flight.vehicle, 4)
