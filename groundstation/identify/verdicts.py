@@ -108,10 +108,9 @@ def _either(
     for i, size, spread in zip(figures.sizes(name), weighed.size, weighed.spread, strict=True):
         middle, half = figures.free[i].neutral + size, figures.critical * spread
         other[i] = (middle - half, middle + half)
-    seen = [i for i in figures.of(name) if np.any(figures.jacobian[:, :, i])]
     return tuple(
         replace(p, low=min(p.low, other[i][0]), high=max(p.high, other[i][1])) if i in other else p
-        for i, p in zip(seen, told, strict=True)
+        for i, p in zip(_told(figures, name), told, strict=True)
     )
 
 
@@ -275,15 +274,23 @@ def also_possible(verdict: EffectVerdict, rivals: tuple[str, ...]) -> EffectVerd
 def estimates(fitted: Fit, name: str) -> tuple[ParameterEstimate, ...]:
     """The parameters of an effect with their intervals; an axis that the flight does not measure has none. Of several
     flights, one that holds for a single one has its number; of those that change in flight, the last."""
+    return tuple(estimate(fitted, i) for i in _told(fitted, name))
+
+
+def _told(fitted: Fit, name: str) -> list[int]:
+    """Columns of the numbers of an effect that are told."""
     last = {(fitted.free[i].parameter.name, fitted.free[i].span.flight): i for i in fitted.of(name)}
-    return tuple(estimate(fitted, i) for i in last.values() if np.any(fitted.jacobian[:, :, i]))
+    return [i for i in last.values() if np.any(fitted.jacobian[:, :, i])]
 
 
 def estimate(fitted: Fit, index: int) -> ParameterEstimate:
-    """One free number with its interval."""
-    free = fitted.free[index]
+    """One free number with its interval; one that has run into its bounds is not known, and may be nothing."""
+    free, value = fitted.free[index], float(fitted.estimate[index])
     p, flight = free.parameter, "" if free.span.flight is None else str(free.span.flight)
-    return ParameterEstimate(p.name, float(fitted.estimate[index]), *fitted.interval(index), p.unit, flight)
+    low, high = fitted.interval(index)
+    if not p.structural and not free.low < value < free.high:
+        low, high = min(low, free.neutral), max(high, free.neutral)
+    return ParameterEstimate(p.name, value, low, high, p.unit, flight)
 
 
 def _tell(others: Sequence[str], effect: Effect) -> str:
