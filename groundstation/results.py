@@ -602,6 +602,14 @@ class Diagnosis:
             )
         return tuple(said)
 
+    @property
+    def to_add(self) -> tuple[str, ...]:
+        """Names of what is missing from a model of the vehicle as it is now, in order of rank: not what ended in
+        flight, nor what is each flight's own."""
+        missing = [e for e in self.effects if e.verdict == "missing"]
+        now = [e for e in missing if e.over_time is None or not e.over_time.ended]
+        return tuple(e.name for e in sorted(now, key=lambda e: e.rank or 0) if e.name not in self.set_aside)
+
     def named(self, verdict: str) -> tuple[str, ...]:
         """Names of the effects with this verdict, in order of rank."""
         return tuple(e.name for e in self.effects if e.verdict == verdict)

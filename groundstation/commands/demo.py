@@ -103,7 +103,7 @@ class _Terminal:
 
     def diagnosed(self, diagnosis: Diagnosis) -> None:
         """The tables of `diagnose`."""
-        from trueflight.groundstation.output.tables import print_diagnosis
+        from trueflight.groundstation.output.ranking import print_diagnosis
 
         print_diagnosis(console, diagnosis)
 

@@ -76,7 +76,7 @@ def diagnose_command(
     from trueflight.groundstation.identify.flights import diagnose_flights
     from trueflight.groundstation.identify.rotors import thrust_from_rotors
     from trueflight.groundstation.output.as_json import analysis_table
-    from trueflight.groundstation.output.tables import print_diagnosis
+    from trueflight.groundstation.output.ranking import print_diagnosis
     from trueflight.groundstation.reading.several import read_held_out, read_together
     from trueflight.groundstation.versions.choice import choose_design, choose_line
 
@@ -94,7 +94,7 @@ def diagnose_command(
             flights, line[-1], held_out, bandwidth, per_flight or (), shared or (), progress, well
         )
         if save is None and not as_json:
-            print_diagnosis(console, found, everything)
+            print_diagnosis(console, found, everything, validate)
             return
         whole = gather(found, line, held_out, bandwidth, choose_design(found.flight), progress=progress)
     if save is not None:
@@ -104,5 +104,5 @@ def diagnose_command(
     if as_json:
         print_json({**analysis_table(whole), "recording": None if save is None else str(save)})
         return
-    print_diagnosis(console, whole.diagnosis, everything)
+    print_diagnosis(console, whole.diagnosis, everything, validate)
     print_written(console, save)

@@ -30,6 +30,7 @@ from trueflight.models.printed import print_json
 from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
+    from trueflight.models.flight import Flight
     from trueflight.models.model import Model
 
 console = Console()
@@ -43,13 +44,22 @@ def register(app: typer.Typer) -> None:
 
 @model_app.command("add")
 def model_add(
-    effect: Annotated[str, typer.Argument(help="Name of the effect: groundstation effects")],
+    *,
+    effect: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Names of the effects, fitted together: groundstation effects", show_default=False
+        ),
+    ] = None,
     flight: Annotated[
         list[Path],
         typer.Option(
             "--flight", help="The flight to fit to. Repeat for several of one vehicle, oldest first."
         ),
     ],
+    missing: Annotated[
+        bool, typer.Option("--missing", help="Add whatever `groundstation diagnose` calls missing.")
+    ] = False,
     validate: Annotated[
         Path | None, typer.Option("--validate", help="Another flight, to see the error fall on.")
     ] = None,
@@ -64,18 +74,21 @@ def model_add(
     save: SaveOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Add an effect: refit, write a new model version, and show the error falling.
+    """Add effects: refit, write a new model version, and show the error falling.
 
-    From several flights it takes what is the vehicle's; what is each flight's own is fitted beside and left out.
+    Effects that are missing together are to be added together: alone, each takes up a part of the others. From several
+    flights it takes what is the vehicle's; what is each flight's own is fitted beside and left out.
 
     Example: groundstation model add rotor_drag --flight identify.csv --validate validate.csv
     """
+    if bool(effect) == missing:
+        raise InputError("name the effects to add, or pass --missing; not both")
     from trueflight.groundstation.evaluate.compare import compare, waterfall
     from trueflight.groundstation.output import as_json as tables_json
     from trueflight.groundstation.output.several_tables import print_left_out
     from trueflight.groundstation.output.tables import print_waterfall
     from trueflight.groundstation.reading.several import read_held_out, read_together
-    from trueflight.groundstation.versions.choice import choose_model
+    from trueflight.groundstation.versions.choice import choose_model, choose_start
     from trueflight.groundstation.versions.several import add_effect_to
     from trueflight.groundstation.versions.store import lineage
     from trueflight.groundstation.versions.store import save as save_version
@@ -84,8 +97,13 @@ def model_add(
     read = flights[-1]
     held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
     base = choose_model(read, model, store, effects)
-    with working(console, f"fitting {effect}", as_json):
-        told = add_effect_to(base, effect, flights, bandwidth, per_flight or (), shared or ())
+    names = effect or _missing(
+        flights, choose_start(read, model, store, effects), held_out, bandwidth, as_json
+    )
+    if not names:
+        raise InputError("nothing is missing that these flights could show: there is nothing to add")
+    with working(console, f"fitting {', '.join(names)}", as_json):
+        told = add_effect_to(base, names, flights, bandwidth, per_flight or (), shared or ())
     made, path = save_version(store, told.model, base if base.version else None)
     line = lineage(store, made)
     steps = waterfall(read, held_out, line, bandwidth)
@@ -108,23 +126,36 @@ def model_add(
         )
         return
     print_waterfall(console, steps, read.name, None if held_out is None else held_out.name)
-    _print_added(made, base, effect)
+    _print_added(made, base)
     print_left_out(console, told.left_out, told.differing)
     console.print(f"model version: {path}")
     print_written(console, save)
 
 
-def _print_added(made: Model, base: Model, effect: str) -> None:
+def _missing(
+    flights: list[Flight], start: Model, held_out: Flight | None, bandwidth: float | None, as_json: bool
+) -> list[str]:
+    """What a diagnosis calls missing, and holds for the vehicle now."""
+    from trueflight.groundstation.identify.flights import diagnose_flights
+
+    with working(console, "looking for missing effects", as_json) as progress:
+        found = diagnose_flights(flights, start, held_out, bandwidth, progress=progress)
+    return list(found.to_add)
+
+
+def _print_added(made: Model, base: Model) -> None:
+    added = [t for t in made.terms if t.effect not in base.names() and t.values]
     if base.network is not None:
         console.print(
-            f"v{made.version} has no network: that of v{base.version} was trained on what is left without {effect}; "
-            f"train a new one with 'groundstation train FLIGHT... --model v{made.version}'",
+            f"v{made.version} has no network: that of v{base.version} was trained on what is left without "
+            f"{', '.join(t.effect for t in added)}; train a new one with "
+            f"'groundstation train FLIGHT... --model v{made.version}'",
             style="yellow",
         )
-    term = made.terms[-1]
-    for name, value in term.values.items():
-        low, high = term.intervals[name]
-        console.print(f"{effect} {name} = {value:.4g}  [{low:.4g}, {high:.4g}]")
+    for term in added:
+        for name, value in term.values.items():
+            low, high = term.intervals[name]
+            console.print(f"{term.effect} {name} = {value:.4g}  [{low:.4g}, {high:.4g}]")
 
 
 @model_app.command("list")
@@ -159,8 +190,8 @@ def model_list(
         print_json([*(model_table(m) for m in models), *damaged])
         return
     table = Table()
-    for column in ("vehicle", "version", "from", "effects", "fit RMS m/s²", "made"):
-        table.add_column(column)
+    for column in ("vehicle", "version", "from", "effects", "fit RMS\nm/s²", "made"):
+        table.add_column(column, overflow="fold")
     for m in models:
         parent = "linear" if m.parent is None else f"v{m.parent}"
         table.add_row(
@@ -169,7 +200,7 @@ def model_list(
             parent,
             ", ".join((*m.names(), *(() if m.network is None else (m.network.label,)))),
             f"{fit_rms(m):.3f}",
-            m.created,
+            m.created[:16].replace("T", " "),
         )
     console.print(table)
     for one in damaged:

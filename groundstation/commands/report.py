@@ -72,7 +72,7 @@ def report_command(
     from trueflight.groundstation.evaluate.side_by_side import side_by_side
     from trueflight.groundstation.identify.flights import diagnose_flights
     from trueflight.groundstation.output.as_json import analysis_table
-    from trueflight.groundstation.output.tables import print_diagnosis
+    from trueflight.groundstation.output.ranking import print_diagnosis
     from trueflight.groundstation.reading.several import read_beside, read_held_out, read_together, told_apart
     from trueflight.groundstation.report import chosen, render, write_report
     from trueflight.groundstation.versions.choice import choose_design, choose_line, choose_model

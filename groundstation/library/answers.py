@@ -286,7 +286,7 @@ class Diagnosis(results.Diagnosis):
     def summary(self, everything: bool = False) -> Summary:
         """Verdicts and residuals as `groundstation diagnose` prints them; with `everything` the parameters of effects
         that were not found, too."""
-        from trueflight.groundstation.output.tables import print_diagnosis
+        from trueflight.groundstation.output.ranking import print_diagnosis
 
         return summary_of(lambda console: print_diagnosis(console, self, everything))
 

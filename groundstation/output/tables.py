@@ -12,15 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
-from trueflight.groundstation.output.several_tables import print_several
-from trueflight.groundstation.results import (
-    Comparison,
-    Diagnosis,
-    EffectVerdict,
-    IdentifiedVehicle,
-    WaterfallStep,
-    WhereItFails,
-)
+from trueflight.groundstation.results import Comparison, IdentifiedVehicle, WaterfallStep, WhereItFails
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model
 
@@ -108,105 +100,6 @@ def print_where(console: Console, where: WhereItFails) -> None:
         console.print(Text("Worst moments", style="bold"))
     for moment in where.worst[:3]:
         console.print(f"  {moment.start:6.1f} to {moment.end:.1f} s  {moment.rms:.2f} m/s²  {moment.text}")
-
-
-def print_diagnosis(console: Console, d: Diagnosis, everything: bool = False) -> None:
-    """The ranking of effects, and the residual before and after."""
-    shown = [e for e in d.effects if everything or e.verdict in ("missing", "possible")]
-    if shown:
-        table = Table(title=f"{_of(d)}: which effect is missing", title_justify="left")
-        table.add_column("effect", no_wrap=True)
-        table.add_column("verdict", no_wrap=True)
-        table.add_column("share of\nerror", justify="right")
-        table.add_column("parameters, 95 % interval", no_wrap=True)
-        table.add_column("sure", justify="right")
-        table.add_column("not told from")
-        for e in shown:
-            table.add_row(
-                e.name,
-                Text(SAID[e.verdict], style=VERDICT_STYLE[e.verdict]),
-                percent(e.variance_share) if e.rank else "",
-                _parameters(e),
-                "" if e.confidence is None else percent(min(e.confidence, 0.999)),
-                ", ".join(e.indistinguishable_from),
-            )
-        console.print(table)
-    else:
-        console.print(Text(f"{_of(d)}: nothing is missing that this flight could show", style="bold green"))
-    line = f"residual {d.rms_before:.3f} -> {d.rms_after:.3f} m/s² (noise floor {d.noise_floor:.3f})"
-    if d.validation_before is not None and d.validation_after is not None:
-        line += f"; held-out flight {d.validation_before:.3f} -> {d.validation_after:.3f} m/s²"
-    console.print(Text(line, style="bold"))
-    if d.flights:
-        print_several(console, d)
-    for remark in d.remarks:
-        console.print(remark, style="yellow", highlight=False)
-    if d.rotational is not None:
-        r = d.rotational
-        told = (
-            f"angular acceleration {r.before:.3f} -> {r.after:.3f} rad/s² (noise floor {r.noise_floor:.3f})"
-        )
-        if r.source == "attitude":
-            told += f", from the attitude, which holds up to {r.bandwidth:.1f} Hz: no gyroscope was logged"
-        console.print(told, highlight=False)
-    if d.shares is not None:
-        carried = " ".join(f"{100 * x:.1f}" for x in d.shares.shares)
-        style = "yellow" if d.shares.rotor else ""
-        console.print(
-            f"each rotor's part of the thrust, %: {carried}" + (f"; {d.shares.told}" if d.shares.told else ""),
-            style=style, highlight=False,
-        )  # fmt: skip
-    for names in d.alternatives:
-        console.print(f"As well explained by {' with '.join(names)}", style="yellow", highlight=False)
-    if d.unexplained.verdict:
-        console.print(
-            f"Unexplained: {percent(d.unexplained.variance_share)} of what is left is more than noise and fits no "
-            f"known effect: {'; '.join(d.unexplained.where)}. More: groundstation remainder FLIGHT",
-            style="yellow",
-        )
-    for note in d.flight.notes:
-        console.print(f"note: {escape(note)}", style="dim")
-    if absent := d.named("not_supported"):
-        console.print(f"[dim]Looked for and not there:[/dim] {', '.join(absent)}", highlight=False)
-    for e in d.effects:
-        if e.verdict == "missing":
-            rests = f"; {e.rests_on}" if e.rests_on else ""
-            console.print(f"[bold]{e.name}[/bold]: {e.advice}{rests}", highlight=False)
-    for e in d.effects:
-        if e.verdict in ("possible", "minor", "not_excited") and e.advice:
-            rests = f"; {e.rests_on}" if e.rests_on else ""
-            console.print(f"[dim]{SAID[e.verdict]}[/dim] {e.name}: {e.advice}{rests}", highlight=False)
-
-
-def _of(d: Diagnosis) -> str:
-    if not d.flights:
-        return d.flight.name
-    return f"{len(d.flights)} flights of {d.flight.vehicle.name}"
-
-
-def _parameters(e: EffectVerdict) -> str:
-    if e.over_time is not None:
-        return "\n".join(line.replace("], ", "],\n  ") for line in e.over_time.lines)
-    told = [
-        f"{p.name} not determined"
-        if p.name in e.undetermined
-        else f"{p.name} = {p.value:.3g} {_unit(p.unit)}  [{p.low:.3g}, {p.high:.3g}]"
-        for p in e.parameters
-        if not p.flight
-    ]
-    own = dict.fromkeys(p.name for p in e.parameters if p.flight)
-    told += [f"{', '.join(own)}: each flight's own"] if own else []
-    several = any(p.flight for p in e.parameters)
-    told += [
-        f"{p.name} = {p.value:.3g}  [{p.low:.3g}, {p.high:.3g}]"
-        for p in e.products
-        if not several or "@" not in p.name
-    ]
-    return "\n".join(told)
-
-
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else unit
 
 
 def print_waterfall(

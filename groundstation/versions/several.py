@@ -40,24 +40,26 @@ class Made:
 
 def add_effect_together(
     base: Model,
-    effect: str,
+    effect: str | Sequence[str],
     flights: Sequence[Flight],
     bandwidth: float | None = None,
     whose: Ownership = BY_FILE,
 ) -> Made:
-    """`base` with one more effect, every parameter refitted to all of `flights`, which are in the order of time.
+    """`base` with one more effect, or several at once, every parameter refitted to all of `flights`.
 
-    Wind and the like, which belong to a flight, are fitted beside where they show. Raises `InputError` as
-    `versions.store.add_effect`, for flights that do not belong together, and for an effect that is each flight's own.
+    The flights are in the order of time. Wind and the like, which belong to a flight, are fitted beside where they
+    show. Raises `InputError` as `versions.store.add_effect`, for flights that do not belong together, and for an effect
+    that is each flight's own.
     """
     check_together(flights)
     model = extended(base, effect, flights)
     with threadpool_limits(1, user_api="blas"):
-        return _fitted(model, effect, told_apart(flights), bandwidth, whose)
+        added = [n for n in model.names() if n not in base.names()]
+        return _fitted(model, added, told_apart(flights), bandwidth, whose)
 
 
 def _fitted(
-    model: Model, effect: str, flights: Sequence[Flight], bandwidth: float | None, whose: Ownership
+    model: Model, added: Sequence[str], flights: Sequence[Flight], bandwidth: float | None, whose: Ownership
 ) -> Made:
     shown = [thinned(f, max(LEAST, FITTED / len(flights))) for f in flights]
     names = [f.name for f in flights]
@@ -70,11 +72,12 @@ def _fitted(
         whose=whose,
     )
     effects = problem.effects
-    if _is_of_flights(effects[effect], whose):
-        raise InputError(
-            f"{effect} is each flight's own, and no part of a vehicle's model; add it from one flight, or say "
-            f"--shared {effect}"
-        )
+    for effect in added:
+        if _is_of_flights(effects[effect], whose):
+            raise InputError(
+                f"{effect} is each flight's own, and no part of a vehicle's model; add it from one flight, or say "
+                f"--shared {effect}"
+            )
     fitted = [t for t in terms if effects[t.effect].parameters and not effects[t.effect].rotational]
     problem = replace(problem, base=model.with_terms(tuple(t for t in terms if t not in fitted)))
     differing: list[SharedNumber] = []
@@ -151,14 +154,15 @@ def _made(
 
 def add_effect_to(
     base: Model,
-    effect: str,
+    effect: str | Sequence[str],
     flights: Sequence[Flight],
     bandwidth: float | None = None,
     per_flight: Sequence[str] = (),
     shared: Sequence[str] = (),
 ) -> Made:
-    """`base` with one more effect, from one flight or from several; `per_flight` and `shared` as in `ownership`.
+    """`base` with one more effect, or several at once, from one flight or from several.
 
+    `per_flight` and `shared` as in `ownership`.
     Raises `InputError` as `versions.store.add_effect` and `add_effect_together`.
     """
     whose = ownership(per_flight, shared, base.effects_directory)

@@ -98,10 +98,12 @@ def save(store: Path, model: Model, parent: Model | None) -> tuple[Model, Path]:
     return stamped, path
 
 
-def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: float | None = None) -> Model:
-    """`base` with one more effect, every parameter refitted to `flights`; not yet saved.
+def add_effect(
+    base: Model, effect: str | Sequence[str], flights: Sequence[Flight], bandwidth: float | None = None
+) -> Model:
+    """`base` with one more effect, or several at once, every parameter refitted to `flights`; not yet saved.
 
-    A network of `base` is dropped: it was trained on what the effects without this one leave over.
+    A network of `base` is dropped: it was trained on what the effects without these leave over.
 
     Raises `InputError` for an effect that is there already, acts only through one that is not, or needs columns that
     a flight lacks.
@@ -109,8 +111,17 @@ def add_effect(base: Model, effect: str, flights: Sequence[Flight], bandwidth: f
     return refit(extended(base, effect, flights), flights, bandwidth)
 
 
-def extended(base: Model, effect: str, flights: Sequence[Flight]) -> Model:
-    """`base` with one more effect at "no effect", without its network. Raises `InputError` as `add_effect`."""
+def extended(base: Model, effect: str | Sequence[str], flights: Sequence[Flight]) -> Model:
+    """`base` with effects more at "no effect", without its network. Raises `InputError` as `add_effect`."""
+    names = [effect] if isinstance(effect, str) else list(effect)
+    model = base
+    # what acts through another comes after it
+    for name in sorted(names, key=lambda n: bool(effect_named(n, base.effects_directory).acts_through)):
+        model = _with_one_more(model, name, flights)
+    return model
+
+
+def _with_one_more(base: Model, effect: str, flights: Sequence[Flight]) -> Model:
     known = effect_named(effect, base.effects_directory)
     if effect in base.names():
         raise InputError(f"{effect} is in {base.label} already; 'model refit' fits its parameters anew")
