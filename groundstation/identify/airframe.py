@@ -29,6 +29,8 @@ WELL_EXPLAINED = 0.75
 much as its rotors do, and the rate loop answers it: gains come out too small, and inertias too large."""
 STARTS = tuple((delay, lag) for delay in (0.0, 0.01, 0.025, 0.05) for lag in (0.01, 0.03, 0.06, 0.12))
 """s of delay and lag that a fit may begin from."""
+LATEST = 0.4
+"""s, the most that a delay or a lag is looked for; an interval that reaches it has no end."""
 SPEEDS = "from command to rotor speed"
 HELD = 0.01
 """Relative 95 % uncertainty where rotors are seen through their commands: a log does not say when, within a sample, a
@@ -125,7 +127,8 @@ def _determined(number: VehicleNumber, told: set[str]) -> bool:
     """Whether the axes that show it are well explained, and its interval has ends."""
     axis = {"inertia_x": {"x"}, "inertia_y": {"y"}, "rotor_lag": {"x", "y"}, "rotor_delay": {"x", "y"}}
     shown = number.told == SPEEDS or bool(axis.get(number.name, {"z"}) & told)
-    return shown and bool(np.isfinite(number.low) and np.isfinite(number.high))
+    ends = bool(np.isfinite(number.low) and np.isfinite(number.high))
+    return shown and ends and (number.unit != "s" or number.high < LATEST)
 
 
 def _misfit(turning: Turning) -> float:
