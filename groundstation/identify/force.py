@@ -264,6 +264,8 @@ class ForceProblem:
         for effect in self.effects.values():
             own = sizes(effect)
             if effect.stage is Stage.AIR and own and effect.needs_yaw and all(p.unit == "m/s" for p in own):
+                if effect.lacks(self.flight):
+                    return None
                 speeds = np.array([p.typical for p in own])
                 pushes = self.contribution(here, whole(effect)) / speeds
                 push = float(np.sqrt(np.mean(np.sum(pushes**2, axis=0)) / len(here.residual)))

@@ -9,12 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from trueflight.groundstation.identify.rotation import judge_rotation
 from trueflight.groundstation.identify.shares import motor_shares
+from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.measured.attitude_rate import rate_from_attitude
 from trueflight.groundstation.measured.measurement import measure_rotation
 from trueflight.groundstation.results import EffectVerdict
 from trueflight.models.effects import effect_named
 from trueflight.models.effects.rotor_damage import leverage
 from trueflight.models.flight import Flight
+from trueflight.models.model import rigid_body_model
 from trueflight.models.prediction import apply_effects, motion_of_flight
 
 
@@ -160,3 +162,13 @@ def test_without_rotor_data_a_weaker_rotor_costs_what_the_allocation_does_not_ma
     assert len(values) == rotors and sum(leverage(craft)) == pytest.approx(4.0)
     motion = apply_effects(motion_of_flight(flight), [(effect_named("rotor_damage"), values)])
     np.testing.assert_allclose(motion.thrust, motion_of_flight(flight).thrust / asked[0], rtol=1e-9)
+
+
+def test_gusts_are_not_asked_of_a_flight_that_has_no_attitude() -> None:
+    flight = flown(vehicle(4), seconds=20.0, seed=50)
+    draw = np.random.default_rng(51)
+    shaken = flight.specific_force + [0.0, 0.0, 1.0] * np.cumsum(
+        0.05 * draw.standard_normal((len(flight), 1)), axis=0
+    )
+    alone = replace(flight, quaternion=None, velocity=None, specific_force=shaken)
+    assert diagnose(alone, rigid_body_model(alone.vehicle)).unexplained.verdict
