@@ -205,6 +205,34 @@ def test_a_light_process_loads_no_heavy_library(module: str) -> None:
     assert out.stdout.strip() == "[]"
 
 
+def test_a_diagnosis_begins_without_what_it_may_not_need() -> None:
+    import subprocess
+
+    dear = {
+        "scipy.stats",
+        "scipy.signal",
+        "scipy.optimize",
+        "pandas",
+        "pyarrow",
+        "torch",
+        "control",
+        "matplotlib",
+    }
+    modules = ("evaluate.analysis", "identify.translation", "reading", "output.tables", "output.as_json")
+    wanted = ", ".join(f"trueflight.groundstation.{m}" for m in modules)
+    code = f"import sys, {wanted}; print(sorted({dear!r} & set(sys.modules)))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert out.stdout.strip() == "[]"
+
+
+def test_a_comparison_is_drawn_without_torch() -> None:
+    import subprocess
+
+    code = "import sys, trueflight.groundstation.views; print('torch' in sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert out.stdout.strip() == "False"
+
+
 @pytest.mark.parametrize(
     "module",
     [

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from trueflight.groundstation.identify.adequacy import ABOVE, MATERIAL, spectrum_of
 from trueflight.groundstation.measured.measurement import Measurement
@@ -110,6 +110,8 @@ def process_of(
 
     total = float(np.sqrt(max(np.mean(np.sum(observed - floor, axis=1)), 1e-12)))
     starts = [np.array([np.log(total), np.log(tau), 0.0]) for tau in (0.3, 1.0, 3.0)]
+    from scipy import optimize  # dear to load
+
     found = min((optimize.minimize(cost, s, method="Nelder-Mead") for s in starts), key=lambda r: r.fun)
     size, tau, _ = np.exp(found.x)
     duration = 1.0 / step

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import optimize
 
 from trueflight.groundstation.identify.fitting import Fit, variance_per_independent_sample
 from trueflight.groundstation.identify.force import ForceProblem
@@ -33,6 +32,8 @@ def late_instead(problem: ForceProblem, here: Fit, without: Fit) -> float | None
     if problem.flight.specific_force is not None:
         return math.nan
     unit = variance_per_independent_sample(problem, here.residual)
+    from scipy import optimize  # dear to load
+
     found = optimize.minimize_scalar(
         lambda late: _left(problem, without, float(late)), bounds=(0.0, LATEST), method="bounded",
         options={"xatol": 0.002},

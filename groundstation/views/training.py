@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from trueflight.groundstation.learn.ablation import Ablation, Architecture
-from trueflight.groundstation.learn.training import Training
-from trueflight.groundstation.learn.training_data import Samples
 from trueflight.groundstation.views.bars import words
 from trueflight.groundstation.views.colour import AXES, FLOOR, LINEAR, NEWEST, WARNING, Colour
 from trueflight.groundstation.views.recording import recording, text
 from trueflight.models.network import error_acceleration_of
+
+if TYPE_CHECKING:  # torch: what only draws a comparison does not wait for it
+    from trueflight.groundstation.learn.ablation import Ablation, Architecture
+    from trueflight.groundstation.learn.training import Training
+    from trueflight.groundstation.learn.training_data import Samples
 
 EPOCH = "epoch"
 """The timeline of a training."""
