@@ -11,9 +11,9 @@ and the same candidate terms:
 * mujoco.sysid: its optimiser on the same prediction with every candidate free, and its 95 % intervals: an effect is
   missing where the interval leaves out "no effect". (Its extras must be installed: pip install "mujoco[sysid]".)
 
-A method is right where the set it calls missing is the hidden one. Seconds include everything from the flight in memory
-to the answer; columns that several methods share are counted for each. Effects seen in the rotation alone are left out:
-the others have no data for them.
+A method is right where the set it calls missing is the hidden one. Seconds are those of the processor and include
+everything from the flight in memory to the answer; columns that several methods share are counted for each. Effects
+seen in the rotation alone are left out: the others have no data for them.
 """
 
 from __future__ import annotations
@@ -266,14 +266,14 @@ def measure_all(first: int, count: int) -> dict[str, dict[str, float]]:
             for method in tried.values():  # imports and caches are no part of anybody's time
                 method(flight)
         for name, method in tried.items():
-            begin = time.perf_counter()
+            begin = time.process_time()
             try:
                 said = method(flight)
             except (ValueError, RuntimeError, np.linalg.LinAlgError):
                 said = frozenset({"(failed)"})
                 table[name]["failed"] += 1
             row = table[name]
-            row["seconds"] += time.perf_counter() - begin
+            row["seconds"] += time.process_time() - begin
             row["right"] += said == truth
             row["false_alarms"] += bool(said) and not truth
             row["found"] += len(said & truth)
