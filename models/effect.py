@@ -20,6 +20,9 @@ from trueflight.models.array import ABSENT, Array
 from trueflight.models.flight import Flight
 from trueflight.models.vehicle import GRAVITY, Vehicle
 
+ROTOR_SHARE, CENTRE_SHARE = "rotor", "centre"
+"""What an effect does to the part of the thrust that each rotor carries: one rotor, that of its parameter, has to be
+driven harder; or the centre of the thrust moves, along body x and y, in m."""
 DESCENT, BELOW_CEILING = "descent", "below_ceiling"
 """Flights that alone show some effects: a fast descent into one's own wake; close below something that hangs."""
 
@@ -157,6 +160,7 @@ class Effect:
     reason why an effect has no confounder. `rotational` effects are found in the angular acceleration; `seen_as`
     names the effects that such a one is taken for where the flight lacks the columns to tell. `exclusive` is True
     where at most one of the parameters acts (the one rotor that is damaged): each is then a candidate on its own.
+    `in_shares` says how it shows in what each rotor carries: `ROTOR_SHARE` or `CENTRE_SHARE`.
     `typical_for` gives sizes that depend on where the flight went (a ceiling just above its highest point) instead
     of the parameters' own; `starts_for` further values to begin a fit from, where one start may end in a wrong
     optimum.
@@ -197,6 +201,7 @@ class Effect:
     rotational: bool = False
     seen_as: tuple[str, ...] = ()
     exclusive: bool = False
+    in_shares: str = ""
     typical_for: Callable[[Motion], Mapping[str, float]] | None = None
     starts_for: Callable[[Motion], Sequence[Mapping[str, float]]] | None = None
     exact_rotation: bool = False

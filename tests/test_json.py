@@ -145,6 +145,7 @@ def test_models_against_flights_say_the_same_with_a_recording_as_without(flown: 
         "bound": [run("groundstation bound", flight, *more) for more in ((), saved)],
         "diagnose": [run("groundstation diagnose", flight, *more) for more in ((), saved)],
     }
+    assert runs["diagnose"][0]["identify"]["numbers"] and runs["diagnose"][0]["motor_shares"]["rotor"] is None
     told = run("groundstation identify", flight)
     assert told["inputs"] == "motors" and [e["horizon"] for e in told["fitted"][0]["errors"]] == [
         0.1,

@@ -19,6 +19,7 @@ from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.evaluate.side_by_side import side_by_side as beside
 from trueflight.groundstation.evaluate.tracking import Tracking, missions, track
 from trueflight.groundstation.evaluate.where import where_it_fails
+from trueflight.groundstation.identify.airframe import identify
 from trueflight.groundstation.identify.fitting import MeasuredFlights, fit, model_of
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.measured.measurement import measure
@@ -174,6 +175,7 @@ def gather(
         _reference(flight),
         side_by_side,
         provenance(*_roles(flights or [flight], validation, side_by_side)),
+        identify(flight),
     )
 
 

@@ -58,7 +58,7 @@ def judge_rotation(
     measurable = tuple(n for n, columns in missing.items() if not columns)
     turning = turning_of(flight) if measurable else None
     if turning is None:
-        unseen = judge_shares(shares, [unmeasured(effects[n], c) for n, c in missing.items()])
+        unseen = judge_shares(shares, [unmeasured(effects[n], c) for n, c in missing.items()], effects)
         return RotationalFindings(unseen, (), None, shares)
     problem = TorqueProblem(turning, effects, measurable, tuple(n for n in effects if n in included))
     search = Search(problem)
@@ -79,7 +79,7 @@ def judge_rotation(
     others = [unmeasured(effects[n], c) for n, c in missing.items() if n not in measurable]
     rms = problem.rms(before.fit, found.fit)
     named = in_words(named, {c.effect: t for c in found.choices if (t := over_time(problem, found.fit, c))})
-    verdicts = judge_shares(shares, [*named, *by_weight(absent), *others])
+    verdicts = judge_shares(shares, [*named, *by_weight(absent), *others], effects)
     kept = {v.name for v in verdicts if v.rank is not None}
     spanned = {name: values for name, values in found.fit.spanned.items() if name in kept}
     terms = tuple(t for t in found.fit.terms if t.effect in kept)

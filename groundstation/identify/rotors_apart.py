@@ -15,16 +15,18 @@ from scipy import special
 
 from trueflight.groundstation.identify.doubt import ALPHA, MASTERED, SAME
 from trueflight.groundstation.identify.fitting import Fit, robust_covariance
-from trueflight.groundstation.identify.shares import CHANGED, DAMAGE, DIFFER, WEIGHT
+from trueflight.groundstation.identify.shares import CHANGED, DIFFER
 from trueflight.groundstation.identify.torque import TorqueProblem
 from trueflight.groundstation.identify.verdicts import MINOR, MISSING, POSSIBLE
 from trueflight.groundstation.results import EffectVerdict
+from trueflight.models.effect import ROTOR_SHARE
 
 
 def doubted(verdict: EffectVerdict, problem: TorqueProblem, here: Fit, quiet: bool) -> EffectVerdict:
     """The verdict on what was found in the rotation, after these questions; with no more than noise left (`quiet`) the
     axes agree."""
-    if verdict.name not in (DAMAGE, WEIGHT) or verdict.verdict not in (MISSING, POSSIBLE):
+    shown = problem.effects[verdict.name].in_shares
+    if not shown or verdict.verdict not in (MISSING, POSSIBLE):
         return verdict
     if problem.turning.rotation.flight.rotor_speed is None and _as_built(verdict, problem):
         return replace(
@@ -39,24 +41,21 @@ def doubted(verdict: EffectVerdict, problem: TorqueProblem, here: Fit, quiet: bo
         )
     if verdict.verdict != MISSING:
         return verdict
-    told, other = "", WEIGHT if verdict.name == DAMAGE else DAMAGE
+    told, others = "", [n for n, e in problem.effects.items() if e.in_shares not in ("", shown)]
     if len(problem.turning.rotation.axes) < 3:
         told = "one axis of the attitude was not logged: a weaker rotor and a weight near it look the same"
     elif not quiet and (left := _left(problem, here)) > MASTERED:
         told = (
             f"{100 * left:.0f} % of the angular acceleration (RMS) is not what the rotors' torques make of it"
         )
-    elif not quiet and verdict.name == DAMAGE and (apart := _apart(problem, here)) > SAME:
+    elif not quiet and shown == ROTOR_SHARE and (apart := _apart(problem, here, verdict.name)) > SAME:
         told = f"roll, pitch and yaw, each by itself, differ on its size by {100 * min(apart, 9.99):.0f} %"
     if not told:
         return verdict
     return replace(
         verdict,
         verdict=POSSIBLE,
-        indistinguishable_from=(
-            *verdict.indistinguishable_from,
-            *({other} - {*verdict.indistinguishable_from}),
-        ),
+        indistinguishable_from=tuple(dict.fromkeys((*verdict.indistinguishable_from, *others))),
         rests_on=told,
         advice="it may stand in for what the rotors' torques do not explain; compare with a flight when the vehicle "
         "was healthy (--healthy FLIGHT)",
@@ -67,7 +66,7 @@ def doubted(verdict: EffectVerdict, problem: TorqueProblem, here: Fit, quiet: bo
 def _as_built(verdict: EffectVerdict, problem: TorqueProblem) -> bool:
     """Whether motors that differ as those of a healthy set do make as much, from commands alone."""
     places = np.array(problem.turning.motion.vehicle.rotor_positions, dtype=float)[:, :2]
-    if verdict.name == DAMAGE:
+    if problem.effects[verdict.name].in_shares == ROTOR_SHARE:
         return all(abs(p.value) < CHANGED * DIFFER for p in verdict.parameters)
     granted = CHANGED * DIFFER * np.sqrt(np.sum(places**2, axis=0)) / len(places)
     return all(abs(p.value) < granted["xy".index(p.name)] for p in verdict.parameters)
@@ -80,9 +79,9 @@ def _left(problem: TorqueProblem, here: Fit) -> float:
     return float(np.min(left / np.maximum(measured, 1e-12)))
 
 
-def _apart(problem: TorqueProblem, here: Fit) -> float:
+def _apart(problem: TorqueProblem, here: Fit, name: str) -> float:
     """How much the axes differ on the loss of the rotor, over what it does, both RMS; 0 where chance makes as much."""
-    (own,) = here.of(DAMAGE)
+    (own,) = here.of(name)
     k, axes, count = here.jacobian.shape
     rest = [i for i in range(count) if i != own]
     alone = here.jacobian[:, :, own][:, :, None] * np.eye(axes)

@@ -9,14 +9,15 @@ same vehicle when it was healthy, the change is seen.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from trueflight.groundstation.identify.verdicts import MISSING, POSSIBLE
 from trueflight.groundstation.results import EffectVerdict, MotorShares, ParameterEstimate
-from trueflight.models.effects.rotor_damage import leverage
+from trueflight.models.allocation import leverage
+from trueflight.models.effect import CENTRE_SHARE, ROTOR_SHARE, Effect
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.prediction import rotor_thrust
@@ -38,7 +39,6 @@ DIFFER = 0.05
 motors and moulded propellers."""
 BLOCK = 2.0
 """s over which shares are averaged before their scatter is taken, as residuals are correlated."""
-DAMAGE, WEIGHT = "rotor_damage", "com_offset"
 
 
 def motor_shares(flight: Flight, healthy: Sequence[Flight] = ()) -> MotorShares | None:
@@ -145,30 +145,36 @@ def _standing_out(ratio: np.ndarray) -> tuple[int, float]:
     return rotor, float(excess[rotor])
 
 
-def judge_shares(shares: MotorShares | None, verdicts: Sequence[EffectVerdict]) -> tuple[EffectVerdict, ...]:
+def judge_shares(
+    shares: MotorShares | None, verdicts: Sequence[EffectVerdict], effects: Mapping[str, Effect]
+) -> tuple[EffectVerdict, ...]:
     """`verdicts` on the rotation, with what the shares say where the rotation itself could not: a weaker rotor, or a
-    weight near it, possible and told apart by neither."""
-    if shares is None or not shares.rotor:
+    weight near it, possible and told apart by neither. `effects` are those by name."""
+    told = {v.name: effects[v.name].in_shares for v in verdicts if effects[v.name].in_shares}
+    if shares is None or not shares.rotor or any(v.verdict == MISSING for v in verdicts if v.name in told):
         return tuple(verdicts)
-    if any(v.verdict == MISSING for v in verdicts if v.name in (DAMAGE, WEIGHT)):
-        return tuple(verdicts)
-    return tuple(_from_shares(v, shares) if v.name in (DAMAGE, WEIGHT) else v for v in verdicts)
+    return tuple(
+        _from_shares(v, shares, told[v.name], tuple(n for n in told if told[n] != told[v.name]))
+        if v.name in told
+        else v
+        for v in verdicts
+    )
 
 
-def _from_shares(verdict: EffectVerdict, shares: MotorShares) -> EffectVerdict:
-    """The verdict on one of the two by the shares."""
-    if verdict.name == DAMAGE:
+def _from_shares(
+    verdict: EffectVerdict, shares: MotorShares, shown: str, others: tuple[str, ...]
+) -> EffectVerdict:
+    """The verdict on an effect by the shares; `others` would do the same to them."""
+    found: tuple[ParameterEstimate, ...]
+    if shown == ROTOR_SHARE:
         value, low, high = shares.losses
-        found: tuple[ParameterEstimate, ...] = (
-            ParameterEstimate(f"loss_{shares.rotor}", value, low, high, "1"),
-        )
-        other = WEIGHT
+        found = (ParameterEstimate(f"loss_{shares.rotor}", value, low, high, "1"),)
     else:
+        assert shown == CENTRE_SHARE
         found = tuple(
             ParameterEstimate(n, c, c - h, c + h, "m")
             for n, c, h in zip("xy", shares.centre, shares.centre_errors, strict=True)
         )
-        other = DAMAGE
     return replace(
         verdict,
         verdict=POSSIBLE,
@@ -176,7 +182,7 @@ def _from_shares(verdict: EffectVerdict, shares: MotorShares) -> EffectVerdict:
         variance_share=0.0,
         p_value=1.0,
         parameters=found,
-        indistinguishable_from=(other,),
+        indistinguishable_from=others,
         advice=shares.advice,
         rests_on=shares.told,
         confidence=None,

@@ -2,7 +2,7 @@
 
 from array_api_compat import array_namespace
 
-from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.effect import CENTRE_SHARE, Array, Effect, Motion, Parameter, Stage
 
 
 def formula(motion: Motion, *, x: Array, y: Array) -> Motion:
@@ -36,5 +36,6 @@ EFFECT = Effect(
     needs_any=("rotor_speed", "motor_command"),
     exports=False,
     rotational=True,
+    in_shares=CENTRE_SHARE,
     on_airframe=lambda airframe, values: airframe.with_(centre_of_mass=(values["x"], values["y"])),
 )

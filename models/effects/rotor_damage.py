@@ -2,15 +2,11 @@
 
 from collections.abc import Mapping
 
-import numpy as np
 from array_api_compat import array_namespace
 
-from trueflight.models.effect import Array, Effect, Motion, Parameter, Stage
+from trueflight.models.allocation import leverage
+from trueflight.models.effect import ROTOR_SHARE, Array, Effect, Motion, Parameter, Stage
 from trueflight.models.flight import MOST_ROTORS
-from trueflight.models.vehicle import Vehicle
-
-ROTORS = 4
-"""Rotors of a vehicle whose file does not tell them."""
 
 
 def formula(motion: Motion, **losses: Array) -> Motion:
@@ -36,21 +32,6 @@ def formula(motion: Motion, **losses: Array) -> Motion:
     weaker = xp.stack(each, axis=-1)
     share = xp.sum(weaker, axis=1) / xp.clip(xp.sum(motion.rotor_thrust, axis=1), 1e-9, None)
     return motion.with_(thrust=motion.thrust * share, rotor_thrust=weaker)
-
-
-def leverage(vehicle: Vehicle) -> tuple[float, ...]:
-    """How much of each rotor's own thrust the allocation makes good by that rotor: 1 where there are four, for nothing
-    else can; with more, roll, pitch, yaw and thrust are shared out by the pseudo-inverse of their matrix B, and it is
-    the diagonal of `pinv(B) B`.
-
-    With the rotor's loss l the allocation asks for `1 / n l / (1 - h l)` more thrust than acts (Sherman-Morrison).
-    """
-    count = len(vehicle.rotor_positions)
-    if not count:
-        return (1.0,) * ROTORS
-    x, y, _ = np.array(vehicle.rotor_positions, dtype=float).T
-    allocation = np.stack([np.ones(count), y, -x, -np.array(vehicle.rotor_directions, dtype=float)])
-    return tuple(float(h) for h in np.diag(np.linalg.pinv(allocation) @ allocation))
 
 
 def truth(hidden: Mapping[str, float], neutral: Mapping[str, float]) -> dict[str, float]:
@@ -87,6 +68,7 @@ EFFECT = Effect(
     rotational=True,
     seen_as=("thrust_gain",),
     exclusive=True,
+    in_shares=ROTOR_SHARE,
     truth_for=truth,
     on_airframe=lambda airframe, values: airframe.with_(
         strength=tuple(1.0 - values[f"loss_{i}"] for i in (1, 2, 3, 4))

@@ -13,8 +13,8 @@ from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.measured.attitude_rate import rate_from_attitude
 from trueflight.groundstation.measured.measurement import measure_rotation
 from trueflight.groundstation.results import EffectVerdict
+from trueflight.models.allocation import leverage
 from trueflight.models.effects import effect_named
-from trueflight.models.effects.rotor_damage import leverage
 from trueflight.models.flight import Flight
 from trueflight.models.model import rigid_body_model
 from trueflight.models.prediction import apply_effects, motion_of_flight
