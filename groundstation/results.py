@@ -262,6 +262,20 @@ class OverTime:
         return bool(self.stretches) and self.stretches[-1].absent
 
     @property
+    def courses(self) -> tuple[DriftingParameter, ...]:
+        """Each parameter over time, to be drawn: of stretches both ends."""
+        names = dict.fromkeys(p.name for s in self.stretches for p in s.parameters)
+        drawn = []
+        for name in names:
+            ends = [(s, p) for s in self.stretches for p in s.parameters if p.name == name]
+            times = np.array([t for s, _ in ends for t in (s.start, s.stop)])
+            value, low, high = (
+                np.repeat(x, 2) for x in zip(*((p.value, p.low, p.high) for _, p in ends), strict=True)
+            )
+            drawn.append(DriftingParameter(name, ends[0][1].unit, times, value, low, high))
+        return (*drawn, *self.drift)
+
+    @property
     def lines(self) -> tuple[str, ...]:
         """One line a parameter: what it is until when."""
         told = [

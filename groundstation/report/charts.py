@@ -16,7 +16,7 @@ from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.evaluate.tracking import Tracking
 from trueflight.groundstation.output.cited import unit
 from trueflight.groundstation.report.svg import BESIDE, COLOURS, LEVELS, Colours, Drawing, figure, level
-from trueflight.groundstation.results import Comparison, Moment
+from trueflight.groundstation.results import Comparison, EffectVerdict, Moment
 
 WIDTH = 7.4
 WINDOW = 12.0
@@ -124,6 +124,29 @@ def over_time(
         "overtime",
         f"Residual RMS over {SMOOTHING:g} s along the flight, worst moments numbered and shaded.",
     )
+
+
+def courses(effects: Sequence[EffectVerdict], colours: Colours = COLOURS) -> Drawing | None:
+    """The parameters that change in flight, one under the other, with their 95 % intervals and the moments; None where
+    none does."""
+    told = [
+        (e, e.over_time, c)
+        for e in effects
+        if e.over_time is not None and e.rank
+        for c in e.over_time.courses
+    ]
+    if not told:
+        return None
+    made, axes = figure(len(told), 1, WIDTH, 0.5 + 1.1 * len(told))
+    for ax, (e, over, c) in zip(axes[:, 0], told, strict=True):
+        ax.plot(c.times, c.value, color=colours["after"], linewidth=1.4)
+        ax.fill_between(c.times, c.low, c.high, color=colours["after"], alpha=0.25, linewidth=0)
+        for change in over.changes:
+            ax.axvspan(change.low, change.high, color=colours["worst"], alpha=0.3, linewidth=0)
+            ax.axvline(change.time, color=colours["worst"], linewidth=1.0)
+        ax.set_ylabel(f"{e.name}\n{c.name}" + ("" if c.unit == "1" else f",{unit(c.unit)}"), fontsize=7.0)
+    axes[-1, 0].set_xlabel("time, s")
+    return Drawing(made, "courses", "Parameters that change in flight, over time, with their moments.")
 
 
 def _residual(ax: Any, c: Comparison, colour: str, label: str, clock: float | None = None) -> None:

@@ -42,7 +42,9 @@ def _none(a: Analysis, table: Table) -> Charts:
 
 
 SECTIONS: tuple[Section, ...] = (
-    Section("ranking", "Which effect is missing", _none),
+    Section(
+        "ranking", "Which effect is missing", lambda a, t: {"over_time": charts.courses(a.diagnosis.effects)}
+    ),
     Section("flights", "Numbers of the vehicle, and of each flight", _none, ("flights",)),
     Section(
         "waterfall", "The error as effects are added", lambda a, t: {"bars": charts.waterfall(t["waterfall"])}

@@ -13,6 +13,7 @@ from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.output.as_json import analysis_table
 from trueflight.groundstation.output.cited import CitedValue, environment, sentences
 from trueflight.groundstation.views.bars import bar_groups
+from trueflight.groundstation.views.changes import changes_panel
 from trueflight.groundstation.views.colour import NEWEST, WARNING, Colour, of_version
 from trueflight.groundstation.views.comparison import comparison_panel
 from trueflight.groundstation.views.error import error_curves, moments_log
@@ -74,6 +75,7 @@ def _verdict(stream: rr.RecordingStream, a: Analysis, table: dict[str, Any]) -> 
     ]
     name = f"residual over the flight, RMS over {SMOOTHING:g} s, m/s² (worst moments marked)"
     curves = error_curves(stream, "verdict/residual", versions, name, a.where.worst)
+    changes = changes_panel(stream, a.diagnosis.effects, "verdict/changes/")
     marks = moments_log(
         stream, "verdict/moments", a.where.worst, "worst moments (click on a time to go there)"
     )
@@ -88,7 +90,8 @@ def _verdict(stream: rr.RecordingStream, a: Analysis, table: dict[str, Any]) -> 
             rrb.Horizontal(*shares, waterfall_bars(stream, a.waterfall, "verdict/waterfall/")),
             curves,
             marks,
-            row_shares=[3, 3, 1.5],
+            *(() if changes is None else (changes,)),
+            row_shares=[3, 3, 1.5] if changes is None else [3, 3, 1.5, 4],
         ),
         column_shares=[1, 1],
         name="verdict",
