@@ -83,12 +83,13 @@ class _Promise:
     drift: Drift | None = None
 
 
-def in_time(search: Search, found: State, drifts: bool = True) -> InTime:
-    """`found`, or what changes in flight, where the evidence is for it; without `drifts` at moments alone."""
+def in_time(search: Search, found: State, drifts: bool = True, of: str = "") -> InTime:
+    """`found`, or what changes in flight, where the evidence is for it; without `drifts` at moments alone. `of` is an
+    effect of `found` of which alone it is asked, everything else staying in it."""
     if not _one_flight(search):
         return InTime(found)
     for _ in range(MOST_CHANGES):
-        better = _better(search, found, drifts)
+        better = _better(search, found, drifts, of)
         if better is None:
             break
         if better.drift is not None:
@@ -103,11 +104,11 @@ def _one_flight(search: Search) -> bool:
     return all(a[1] < b[0] for a, b in itertools.pairwise(edges))
 
 
-def _better(search: Search, found: State, drifts: bool) -> InTime | None:
+def _better(search: Search, found: State, drifts: bool, of: str) -> InTime | None:
     """What explains the flight best with changes of one effect more, or a drift."""
     best: State | None = None
     tried: set[tuple[Choice, ...]] = set()
-    promises = list(_promises(search, found))
+    promises = list(_promises(search, found, of))
     unit = min(promises, key=lambda p: p.left).unit if promises else 1.0
 
     def score(promise: _Promise) -> float:
@@ -138,7 +139,7 @@ def _better(search: Search, found: State, drifts: bool) -> InTime | None:
             best = candidate
     if best is None:
         return None
-    grown = _refined(search, search.grown(best))
+    grown = _refined(search, best if of else search.grown(best))
     # what is left of it may be no change at all
     kept = _count(grown) > _count(found)
     return InTime(grown) if kept and search.evident(grown, found) else None
@@ -181,11 +182,13 @@ def p_of_change(fitted: Fit, choice: Choice) -> float:
     )
 
 
-def _promises(search: Search, found: State) -> Iterator[_Promise]:
+def _promises(search: Search, found: State, of: str) -> Iterator[_Promise]:
     """Changes whose linearisation is significant and leaves less than what was found."""
-    for base in _bases(search, found):
+    for base in (found,) if of else _bases(search, found):
         present = {*search.problem.included, *base.names}
         for choice in search.problem.choices:
+            if of not in ("", choice.effect):
+                continue
             needed = search.problem.effects[choice.effect].acts_through
             if not needed or present & set(needed):
                 now = next((c for c in base.choices if c.effect == choice.effect), choice)

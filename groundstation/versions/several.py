@@ -12,12 +12,13 @@ from trueflight.groundstation.identify.differences import asked, fitted_anew
 from trueflight.groundstation.identify.fitting import Fit, MeasuredFlights, model_of
 from trueflight.groundstation.identify.force import MATERIAL_ACCELERATION
 from trueflight.groundstation.identify.joint_force import JointForce, plain
+from trueflight.groundstation.identify.now import as_it_is_now
 from trueflight.groundstation.identify.ownership import BY_FILE, Ownership, needs_several, ownership
 from trueflight.groundstation.identify.search import Search, State, whole
 from trueflight.groundstation.identify.together import FITTED, LEAST, check_together, thinned
 from trueflight.groundstation.measured.measurement import measure
 from trueflight.groundstation.reading.several import told_apart
-from trueflight.groundstation.results import ParameterEstimate, SharedNumber
+from trueflight.groundstation.results import OverTime, ParameterEstimate, SharedNumber
 from trueflight.groundstation.versions.store import add_effect, extended, turned
 from trueflight.models.effect import FLIGHT, Effect
 from trueflight.models.errors import InputError
@@ -30,12 +31,14 @@ class Made:
     """A model fitted to several flights, not yet saved.
 
     `left_out` are numbers that are each flight's own, by effect; `differing` those of the vehicle that are not the same
-    in all flights: the model has them as they were in the last.
+    in all flights: the model has them as they were in the last. `course` is that of an effect that changes in the one
+    flight it was fitted to: the model has what holds at the end.
     """
 
     model: Model
     left_out: dict[str, tuple[ParameterEstimate, ...]]
     differing: tuple[SharedNumber, ...]
+    course: OverTime | None = None
 
 
 def add_effect_together(
@@ -169,4 +172,14 @@ def add_effect_to(
     if len(flights) > 1:
         return add_effect_together(base, effect, flights, bandwidth, whose)
     needs_several(per_flight, shared)
-    return Made(add_effect(base, effect, flights, bandwidth), {}, ())
+    made = add_effect(base, effect, flights, bandwidth)
+    now = as_it_is_now(made, effect, flights[0], bandwidth)
+    if now is None:
+        return Made(made, {}, ())
+    model, course = now
+    if course.ended:
+        raise InputError(
+            f"{flights[0].origin or flights[0].name}: {effect} ended at {course.changes[-1].time:.1f} s "
+            f"({'; '.join(course.lines)}): there is nothing to add for the vehicle as it is now"
+        )
+    return Made(model, {}, (), course)

@@ -8,6 +8,8 @@ from simulated import simulated
 from trueflight.groundstation.identify.gusts import process_of
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.results import Diagnosis, EffectVerdict
+from trueflight.groundstation.versions.several import add_effect_to
+from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
 from trueflight.models.model import rigid_body_model
 
@@ -89,6 +91,21 @@ def test_wind_that_turns_at_once_and_wind_that_turns_by_and_by() -> None:
         assert held.mean() > 0.8, d.name
         np.testing.assert_allclose(d.value, truth, atol=0.15)
     assert not found.unexplained.misfit
+
+
+def test_a_model_gets_what_holds_now_and_nothing_of_what_has_ended() -> None:
+    flight = simulated(3, "none")
+    base = rigid_body_model(flight.vehicle)
+    weaker = as_if(flight, {"thrust_gain": {"gain": step(flight, MOMENT, 1.05, 0.93)}})
+    made = add_effect_to(base, "thrust_gain", [weaker])
+    assert made.model.terms[-1].values["gain"] == pytest.approx(0.93, abs=0.005)
+    low, high = made.model.terms[-1].intervals["gain"]
+    assert low < 0.93 < high < 0.95
+    assert made.course is not None and made.course.changes[0].time == pytest.approx(MOMENT, abs=0.2)
+    fallen = as_if(flight, {"thrust_gain": {"gain": step(flight, MOMENT, 0.87, 1.0)}})
+    with pytest.raises(InputError, match="thrust_gain ended at 23"):
+        add_effect_to(base, "thrust_gain", [fallen])
+    assert add_effect_to(base, "thrust_gain", [flight]).course is None
 
 
 @pytest.mark.parametrize("hidden", ["none", "rotor_drag", "thrust_curve", "battery_sag"])
