@@ -120,7 +120,7 @@ def model_add(
                 "path": str(path),
                 "network_dropped": base.network is not None,
                 **tables_json.left_out_table(told.left_out, told.differing),
-                "over_time": None if told.course is None else tables_json.over_time_table(told.course),
+                "over_time": {n: tables_json.over_time_table(c) for n, c in told.courses.items()},
                 "waterfall": tables_json.waterfall_table(steps),
                 "recording": None if save is None else str(save),
             }
@@ -128,9 +128,9 @@ def model_add(
         return
     print_waterfall(console, steps, read.name, None if held_out is None else held_out.name)
     _print_added(made, base)
-    if told.course is not None:
+    for name, course in told.courses.items():
         console.print(
-            f"{effect} changes in this flight: {'; '.join(told.course.lines)}. The model keeps what holds at its end; "
+            f"{name} changes in this flight: {'; '.join(course.lines)}. The model keeps what holds at its end; "
             "the error above is that of the whole flight.",
             style="yellow",
             highlight=False,

@@ -9,7 +9,7 @@ less the price of the moment. An effect that changes by and by, and not at momen
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,9 +83,9 @@ class _Promise:
     drift: Drift | None = None
 
 
-def in_time(search: Search, found: State, drifts: bool = True, of: str = "") -> InTime:
-    """`found`, or what changes in flight, where the evidence is for it; without `drifts` at moments alone. `of` is an
-    effect of `found` of which alone it is asked, everything else staying in it."""
+def in_time(search: Search, found: State, drifts: bool = True, of: Collection[str] = ()) -> InTime:
+    """`found`, or what changes in flight, where the evidence is for it; without `drifts` at moments alone. `of` are
+    effects of `found` of which alone it is asked, everything else staying in it."""
     if not _one_flight(search):
         return InTime(found)
     for _ in range(MOST_CHANGES):
@@ -104,7 +104,7 @@ def _one_flight(search: Search) -> bool:
     return all(a[1] < b[0] for a, b in itertools.pairwise(edges))
 
 
-def _better(search: Search, found: State, drifts: bool, of: str) -> InTime | None:
+def _better(search: Search, found: State, drifts: bool, of: Collection[str]) -> InTime | None:
     """What explains the flight best with changes of one effect more, or a drift."""
     best: State | None = None
     tried: set[tuple[Choice, ...]] = set()
@@ -182,12 +182,12 @@ def p_of_change(fitted: Fit, choice: Choice) -> float:
     )
 
 
-def _promises(search: Search, found: State, of: str) -> Iterator[_Promise]:
+def _promises(search: Search, found: State, of: Collection[str]) -> Iterator[_Promise]:
     """Changes whose linearisation is significant and leaves less than what was found."""
     for base in (found,) if of else _bases(search, found):
         present = {*search.problem.included, *base.names}
         for choice in search.problem.choices:
-            if of not in ("", choice.effect):
+            if of and choice.effect not in of:
                 continue
             needed = search.problem.effects[choice.effect].acts_through
             if not needed or present & set(needed):

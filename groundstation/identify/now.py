@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from threadpoolctl import threadpool_limits
@@ -21,50 +22,50 @@ from trueflight.models.model import Model, Term
 
 
 def as_it_is_now(
-    model: Model, name: str, flight: Flight, bandwidth: float | None = None
-) -> tuple[Model, OverTime] | None:
-    """`model`, fitted to `flight`, with its effect `name` as it is at the end, everything fitted beside it, and its
-    course; None where it is of one size throughout."""
+    model: Model, names: Sequence[str], flight: Flight, bandwidth: float | None = None
+) -> tuple[Model, dict[str, OverTime]]:
+    """`model`, fitted to `flight`, with its effects `names` as they are at the end, everything fitted beside them; and
+    the courses of those that change."""
     with threadpool_limits(1, user_api="blas"):
-        return _as_it_is_now(model, name, flight, bandwidth)
+        effects = {t.effect: effect_named(t.effect, model.effects_directory) for t in model.terms}
+        courses: dict[str, OverTime] = {}
+        for name in names:
+            if effects[name].rotational and effects[name].stage is not Stage.RATE:
+                told = _turning(effects[name], flight)
+                if told is not None:
+                    term, courses[name] = told
+                    model = model.with_terms(tuple(term if t.effect == name else t for t in model.terms))
+        acting = [n for n in names if not effects[n].rotational]
+        made, seen = _acting(model, effects, acting, flight, bandwidth)
+        return made, courses | seen
 
 
-def _as_it_is_now(
-    model: Model, name: str, flight: Flight, bandwidth: float | None
-) -> tuple[Model, OverTime] | None:
-    effect = effect_named(name, model.effects_directory)
-    if effect.stage is Stage.RATE:
-        return None
-    if effect.rotational:
-        told = _turning(effect, flight)
-        if told is None:
-            return None
-        terms = tuple(told[0] if t.effect == name else t for t in model.terms)
-        return model.with_terms(terms), told[1]
-    known = {t.effect: effect_named(t.effect, model.effects_directory) for t in model.terms}
-    fitted = {n for n, e in known.items() if e.parameters and not e.rotational}
-    flights = MeasuredFlights((measure(flight, bandwidth),), model.effects_directory, model.network_chain())
+def _acting(
+    model: Model, effects: Mapping[str, Effect], names: Sequence[str], flight: Flight, bandwidth: float | None
+) -> tuple[Model, dict[str, OverTime]]:
+    fitted = {n for n, e in effects.items() if e.parameters and not e.rotational}
     rest = model.with_terms(tuple(t for t in model.terms if t.effect not in fitted))
+    flights = MeasuredFlights((measure(flight, bandwidth),), model.effects_directory, model.network_chain())
     problem = ForceProblem(flights, rest, only=lambda e: e.name in fitted)
     search = Search(problem)
-    found = search.state([whole(known[t.effect]) for t in model.terms if t.effect in fitted])
-    timed = in_time(search, found, of=name)
+    if not names:
+        return model, {}
+    found = search.state([whole(effects[t.effect]) for t in model.terms if t.effect in fitted])
+    timed = in_time(search, found, of=names)
     state = timed.state
+    told = {c.effect: over_time(problem, state.fit, c) for c in state.choices}
+    courses = {name: course for name, course in told.items() if course is not None}
+    made = model_of(state.fit, rest)
     if timed.drift is not None:
-        _, state, course = beside_drift(problem, state, timed.drift)
+        name = timed.drift.choice.effect
+        _, state, courses[name] = beside_drift(problem, state, timed.drift)
         made = model_of(state.fit, rest)
-        made = made.with_terms(at_the_end(made.terms, name, course))
-    else:
-        choice = next((c for c in state.choices if c.effect == name), None)
-        changed = None if choice is None else over_time(problem, state.fit, choice)
-        if changed is None:
-            return None
-        made, course = model_of(state.fit, rest), changed
-    if {t.effect for t in made.terms} != {t.effect for t in model.terms}:
-        return None  # something else took the place of another effect of the model
+        made = made.with_terms(at_the_end(made.terms, name, courses[name]))
     by_name = {t.effect: t for t in made.terms}
+    if not courses or set(by_name) != set(effects):
+        return model, {}
     rms = float((state.fit.sse / state.fit.residual.size) ** 0.5)
-    return replace(model, terms=tuple(by_name[t.effect] for t in model.terms), fit={"rms": rms}), course
+    return replace(model, terms=tuple(by_name[t.effect] for t in model.terms), fit={"rms": rms}), courses
 
 
 def _turning(effect: Effect, flight: Flight) -> tuple[Term, OverTime] | None:
@@ -74,7 +75,7 @@ def _turning(effect: Effect, flight: Flight) -> tuple[Term, OverTime] | None:
     problem = TorqueProblem(turning, {effect.name: effect}, (effect.name,))
     search = Search(problem)
     found = min((search.state((choice,)) for choice in problem.choices), key=lambda s: s.fit.sse)
-    state = in_time(search, found, drifts=False, of=effect.name).state
+    state = in_time(search, found, drifts=False, of=(effect.name,)).state
     if not state.choices:
         return None
     course = over_time(problem, state.fit, state.choices[0])

@@ -3,8 +3,8 @@ and what is each flight's own is fitted beside it and left out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from threadpoolctl import threadpool_limits
 
@@ -31,14 +31,14 @@ class Made:
     """A model fitted to several flights, not yet saved.
 
     `left_out` are numbers that are each flight's own, by effect; `differing` those of the vehicle that are not the same
-    in all flights: the model has them as they were in the last. `course` is that of an effect that changes in the one
-    flight it was fitted to: the model has what holds at the end.
+    in all flights: the model has them as they were in the last. `courses` are those of added effects that change
+    in the one flight they were fitted to: the model has what holds at the end.
     """
 
     model: Model
     left_out: dict[str, tuple[ParameterEstimate, ...]]
     differing: tuple[SharedNumber, ...]
-    course: OverTime | None = None
+    courses: Mapping[str, OverTime] = field(default_factory=dict)
 
 
 def add_effect_together(
@@ -173,13 +173,12 @@ def add_effect_to(
         return add_effect_together(base, effect, flights, bandwidth, whose)
     needs_several(per_flight, shared)
     made = add_effect(base, effect, flights, bandwidth)
-    now = as_it_is_now(made, effect, flights[0], bandwidth)
-    if now is None:
-        return Made(made, {}, ())
-    model, course = now
-    if course.ended:
-        raise InputError(
-            f"{flights[0].origin or flights[0].name}: {effect} ended at {course.changes[-1].time:.1f} s "
-            f"({'; '.join(course.lines)}): there is nothing to add for the vehicle as it is now"
-        )
-    return Made(model, {}, (), course)
+    added = [n for n in made.names() if n not in base.names()]
+    model, courses = as_it_is_now(made, added, flights[0], bandwidth)
+    for name, course in courses.items():
+        if course.ended:
+            raise InputError(
+                f"{flights[0].origin or flights[0].name}: {name} ended at {course.changes[-1].time:.1f} s "
+                f"({'; '.join(course.lines)}): there is nothing to add for the vehicle as it is now"
+            )
+    return Made(model, {}, (), courses)

@@ -1,12 +1,16 @@
 """What begins, ends, changes or drifts in flight is told with its moment, and what does not change is not said to."""
 
+import io
+
 import numpy as np
 import pytest
 from changing import as_if, gusty, lagged_noise, ramp, step
+from rich.console import Console
 from simulated import simulated
 
 from trueflight.groundstation.identify.gusts import process_of
 from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.output.ranking import print_diagnosis
 from trueflight.groundstation.results import Diagnosis, EffectVerdict
 from trueflight.groundstation.versions.several import add_effect_to
 from trueflight.models.errors import InputError
@@ -45,6 +49,12 @@ def test_a_load_that_falls_is_a_gain_until_a_moment_and_no_curve(moment: float, 
     assert "there is nothing to add" in verdict.advice
     assert "thrust_gain" not in found.model.names()
     assert not found.unexplained.verdict
+    # whole on 80 columns
+    console = Console(width=80, record=True, file=io.StringIO())
+    print_diagnosis(console, found)
+    assert f"until {change.time:.2f} s [{change.low:.2f}, {change.high:.2f}]" in " ".join(
+        console.export_text().split()
+    )
 
 
 def test_a_change_beside_what_is_always_there_leaves_that_alone() -> None:
@@ -101,11 +111,11 @@ def test_a_model_gets_what_holds_now_and_nothing_of_what_has_ended() -> None:
     assert made.model.terms[-1].values["gain"] == pytest.approx(0.93, abs=0.005)
     low, high = made.model.terms[-1].intervals["gain"]
     assert low < 0.93 < high < 0.95
-    assert made.course is not None and made.course.changes[0].time == pytest.approx(MOMENT, abs=0.2)
+    assert made.courses["thrust_gain"].changes[0].time == pytest.approx(MOMENT, abs=0.2)
     fallen = as_if(flight, {"thrust_gain": {"gain": step(flight, MOMENT, 0.87, 1.0)}})
     with pytest.raises(InputError, match="thrust_gain ended at 23"):
         add_effect_to(base, "thrust_gain", [fallen])
-    assert add_effect_to(base, "thrust_gain", [flight]).course is None
+    assert add_effect_to(base, "thrust_gain", [flight]).courses == {}
 
 
 @pytest.mark.parametrize("hidden", ["none", "rotor_drag", "thrust_curve", "battery_sag"])
