@@ -93,7 +93,7 @@ def test_every_flight_is_a_row_and_a_bad_file_is_skipped(folder, tmp_path, capsy
         "trueflight.groundstation.evaluate.survey.survey_flight",
         lambda file, *task: seen.append(file) or survey_flight(file, *task),
     )
-    code, out, _ = run(capsys, monkeypatch, "survey", folder, "--save", tmp_path, "--jobs", 1)
+    code, out, _ = run(capsys, monkeypatch, "survey", folder, "--save", tmp_path, "--jobs", 1, "--each-alone")
     assert code == 0
     assert len(seen) < 8
     assert "10 of 12 flights could be used, of 2 vehicles" in " ".join(out.split())
