@@ -34,7 +34,7 @@ LATEST = 0.4
 SPEEDS = "from command to rotor speed"
 HELD = 0.01
 """Relative 95 % uncertainty where rotors are seen through their commands: a log does not say when, within a sample, a
-command changed. In 20 seeded flights of four to eight rotors gains were then off by up to 2 %."""
+command changed. In 20 seeded flights of four to eight rotors gains were then off by up to 4 %."""
 STEPS = 2
 """Gauss-Newton steps from the delay and lag that a coarse search has found."""
 STEP = 1e-3

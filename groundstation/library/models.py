@@ -52,8 +52,8 @@ class Model(versions.Model):
         hover_speed: float | None = None,
         torque_length: float | None = None,
     ) -> dict[str, tuple[str, str]]:
-        """Write this model for another simulator, autopilot or solver: `to` is mujoco, rotorpy, crazyflow, gazebo,
-        px4, px4-sih, casadi or sympy.
+        """Write this model to the file `output` for another simulator, autopilot or solver: `to` is mujoco, rotorpy,
+        crazyflow, gazebo, px4, px4-sih, casadi or sympy.
 
         `hover_speed` (rad/s) of the rotors and `torque_length` (m), a rotor's drag torque over its thrust, are a usual
         propeller's where they are not given. Returns of each effect whether the file holds it (whole, roughly, not),

@@ -110,7 +110,7 @@ def test_messages_are_what_the_tick_says_in_the_frames_that_ros_wants():
 
 
 def test_keys_tokens_and_attachments_are_those_of_rmw_zenoh():
-    """The examples of rmw_zenoh's design document, and its types' hashes."""
+    """As rmw_zenoh's source of October 2024 forms them, and its types' hashes."""
     chatter = RosTopic("/chatter", "std_msgs/msg/String")
     assert Messages("x").hash_of("std_msgs/msg/String") == STRING
     assert Messages("x", "humble").hash_of("std_msgs/msg/String") == "TypeHashNotSupported"
