@@ -60,7 +60,7 @@ def next_command(d: Diagnosis, validate: Path | None = None) -> str:
     for flight in flights:
         words += ["--flight", flight.origin]
     source = d.flight.vehicle.source
-    if source and Path(source) != Path(d.flight.origin):
+    if Path(source).is_file():  # a record has it inside
         words += ["--vehicle", source]
     if validate is not None:
         words += ["--validate", str(validate)]
@@ -112,7 +112,7 @@ def _block(d: Diagnosis, e: EffectVerdict) -> Iterator[Text]:
     if e.rests_on:
         yield Text(e.rests_on, style="dim")
     advice = e.advice.removeprefix(f"add it: groundstation model add {e.name}").removeprefix("; ")
-    if advice:
+    if advice and not advice.startswith("no flight can tell it from"):  # told above
         yield Text(advice, style="dim")
 
 

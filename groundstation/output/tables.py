@@ -35,7 +35,9 @@ SAID = {
 
 
 def percent(share: float) -> str:
-    """A share as people read it: 71 %, 0.4 %."""
+    """A share as people read it: 71 %, 0.4 %, < 0.1 %."""
+    if 0.0 < share < 0.0005:
+        return "< 0.1 %"
     return f"{100 * share:.0f} %" if share >= 0.01 or share == 0.0 else f"{100 * share:.1f} %"
 
 
