@@ -137,13 +137,19 @@ class Case:
         return tuple(s.name for s in self.named() if s.verdict == verdict and not self.stands(s))
 
     def untimed(self) -> tuple[str, ...]:
-        """Effects that begin in flight, named without the moment (within `ON_TIME`)."""
-        named = {s.name: s for s in self.named()}
-        return tuple(
-            name
-            for name, moment in self.begins.items()
-            if name in named and all(abs(told - moment) > ON_TIME for told in named[name].moments)
-        )
+        """Effects that begin in flight, named without the moment (within `ON_TIME`).
+
+        Of those that begin together one tells the moment of all: where drag begins, there was no wind to be felt
+        before.
+        """
+        named = {s.name: s.moments for s in self.named() if s.name in self.begins}
+        told = {
+            begun
+            for begun in self.begins.values()
+            for name, moments in named.items()
+            if self.begins[name] == begun and any(abs(moment - begun) <= ON_TIME for moment in moments)
+        }
+        return tuple(name for name in self.begins if name in named and self.begins[name] not in told)
 
     @property
     def wrong(self) -> bool:
@@ -155,7 +161,7 @@ class Case:
     def flagged(self) -> bool:
         """Whether the diagnosis says that its explanation is not all there is: something is unexplained or only
         possible."""
-        return self.unexplained or any(s.verdict == POSSIBLE for s in self.named())
+        return self.unexplained or any(s.verdict == POSSIBLE for s in self.said)
 
     def excitation(self, said: Said) -> float:
         """What the effect changes, RMS, over the noise floor of where it is seen."""

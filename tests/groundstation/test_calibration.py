@@ -179,6 +179,12 @@ def test_an_effect_that_begins_in_flight_is_explained_only_with_the_moment() -> 
     assert (result.unflagged.count, result.unflagged.of) == (2, 4)
     assert result.by["begins in flight"]["one"].of == 4
     assert ["begins at 40 s, told: 20.0 s, 44.0 s" in w.why for w in wrongs(late)] == [True, False]
+    # a wind that comes with its drag is timed by the drag
+    drag, wind = untold.said[0], said("wind", MISSING, 2, 0.0)
+    together = {"rotor_drag": 40.0, "wind": 40.0}
+    for moments, untimed in (((40.0,), ()), ((), ("rotor_drag", "wind"))):
+        both = case(1, tuple(together), replace(drag, moments=moments), wind, begins=together)
+        assert both.untimed() == untimed
     # one that was never named is denied, not untimed
     assert case(2, ("wind",), begins={"wind": 40.0}).untimed() == ()
 
