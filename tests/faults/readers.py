@@ -22,6 +22,11 @@ from pyarrow import parquet as arrow_parquet
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "groundstation"))
 
+from dataflash_writer import copter
+from px4_layouts import flown
+from ros_bag_writer import Bag, as_db3, ros_messages
+from test_mavlink_logs import save as save_tlog
+from test_mavlink_logs import telemetry
 from ulog_writer import TYPES, Written
 
 from trueflight.companion.settings import load_settings as companion_settings
@@ -66,6 +71,22 @@ class Reader:
     seeds: tuple[bytes, ...]
     read: Callable[[Path], object]
     weight: float = 1.0
+
+
+def _foreign(folder: Path, vehicle: Vehicle) -> tuple[Reader, ...]:
+    """Logs of other autopilots and recorders."""
+    one = flown()
+    dataflash = copter(one, imu=25, attitude=10, rate=10).bytes()
+    tlog = save_tlog(folder / "flight.tlog", telemetry(one, rate=10)).read_bytes()
+    db3 = as_db3(ros_messages(Bag(folder / "bag.mcap")), folder / "bag.db3").read_bytes()
+    card = (CRAZYFLIE / "card" / "log08").read_bytes()
+    flier = load_vehicle(CRAZYFLIE / "crazyswarm2_log08.vehicle.toml")
+    return (
+        Reader("dataflash", ".bin", "bytes", (dataflash,), lambda p: read_flight(p, vehicle), 0.6),
+        Reader("telemetry", ".tlog", "bytes", (tlog,), lambda p: read_flight(p, vehicle), 0.6),
+        Reader("ros bag in sqlite", ".db3", "bytes", (db3,), lambda p: read_flight(p, vehicle), 0.6),
+        Reader("card", "", "bytes", (card,), lambda p: read_flight(p, flier), 0.6),
+    )
 
 
 def readers(folder: Path) -> tuple[Reader, ...]:
@@ -143,6 +164,7 @@ def readers(folder: Path) -> tuple[Reader, ...]:
         Reader("record", ".mcap", "bytes", (record, plain), lambda p: read_flight(p), 2.0),
         Reader("record alone", ".mcap", "bytes", (record, plain), read_record),
         Reader("ros bag", ".mcap", "bytes", (bag,), lambda p: read_flight(p, vehicle), 1.0),
+        *_foreign(folder, vehicle),
         Reader("vehicle", ".toml", "toml", ((QUAD5 / "vehicle.toml").read_bytes(),), load_vehicle, 3.0),
         Reader("design", ".json", "json", ((QUAD5 / "design.json").read_bytes(),), load_design, 3.0),
         Reader("model", ".json", "json", (model,), read_model, 3.0),
