@@ -137,7 +137,7 @@ def _step_response(t: np.ndarray, lag: float, integral: float) -> np.ndarray:
     second = integral * quick / first  # their product, which their difference would lose
     out = np.ones(len(t), dtype=complex)
     for pole, other in ((first, second), (second, first)):
-        if pole != 0.0:
+        if abs(pole) > 1e-9 * quick:  # a slower one is that of no integral, and adds nothing
             out += quick * (pole + integral) / (pole * (pole - other)) * np.exp(pole * t)
     return np.asarray(out.real)
 

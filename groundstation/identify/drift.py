@@ -13,6 +13,7 @@ from trueflight.groundstation.identify.search import Choice, Search, State
 from trueflight.groundstation.identify.steps import Course, Wander
 from trueflight.groundstation.identify.verdicts import MISSING, POSSIBLE
 from trueflight.groundstation.results import DriftingParameter, EffectVerdict, OverTime
+from trueflight.models.effect import Effect
 from trueflight.models.model import Term
 
 ROUNDS = 2
@@ -34,6 +35,14 @@ def beside_drift(problem: ForceProblem, found: State, drift: Drift) -> tuple[Sea
         flat = course.added(np.ones_like(wander.course))
         wander = course.wander(course.unit(flat, here.residual))
     return search, state, _told(here, choice, wander)
+
+
+def possible(effect: Effect, told: OverTime) -> bool:
+    """Whether the interval of every drifting number reaches into its physical range throughout the flight."""
+    ranges = {p.name: (p.low, p.high) for p in effect.parameters}
+    return all(
+        bool(np.all(d.high >= ranges[d.name][0]) and np.all(d.low <= ranges[d.name][1])) for d in told.drift
+    )
 
 
 def _told(here: Fit, choice: Choice, wander: Wander) -> OverTime:

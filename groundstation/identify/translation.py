@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from trueflight.groundstation.identify.changes import Drift, in_time, in_words, over_time
 from trueflight.groundstation.identify.doubt import Weighing
-from trueflight.groundstation.identify.drift import at_the_end, beside_drift, drifting
+from trueflight.groundstation.identify.drift import at_the_end, beside_drift, drifting, possible
 from trueflight.groundstation.identify.fitting import (
     Fit,
     MeasuredFlights,
@@ -109,11 +109,15 @@ def _diagnose(
     progress("looking for what changes in flight")
     timed = in_time(everything, found)
     kept = everything.agreed_by_held_out(timed.state)
-    if timed.drift is None or timed.drift.choice not in kept.choices:
-        return _report(search, search.state(kept.choices), everything, rotation)
-    beside, kept, course = beside_drift(entire, kept, timed.drift)
-    diagnosis = _report(beside, kept, beside, rotation, {timed.drift.choice.effect: course})
-    return _with_drift(diagnosis, timed.drift, course)
+    if timed.drift is not None and timed.drift.choice in kept.choices:
+        drift = timed.drift
+        beside, wandering, course = beside_drift(entire, kept, drift)
+        if possible(entire.effects[drift.choice.effect], course):
+            diagnosis = _report(beside, wandering, beside, rotation, {drift.choice.effect: course})
+            return _with_drift(diagnosis, drift, course)
+        # what cannot be is no drift, but may be a change at a moment
+        kept = everything.agreed_by_held_out(in_time(everything, found, drifts=False).state)
+    return _report(search, search.state(kept.choices), everything, rotation)
 
 
 def _with_drift(diagnosis: Diagnosis, drift: Drift, course: OverTime) -> Diagnosis:

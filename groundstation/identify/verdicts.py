@@ -27,6 +27,10 @@ MISSING, POSSIBLE, MINOR, NOT_SUPPORTED, NOT_EXCITED, INCLUDED = (
 ANSWERS = 0.25
 """Confidence that is left of what comes after what it explains: in seeded hovers in gusts none of it was there."""
 
+LAW = 0.1
+"""Part of what an effect does, RMS, by which the law of a vehicle may differ from the catalogue's: a measured thrust
+curve is no parabola, and four rotors near the ground are not one."""
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -64,22 +68,35 @@ def judge(
             weighed = None
         after = answers(search.problem, figures, effect.name) if scale.seen_in != "rotation" else None
         sure = not same and (weighed is None or weighed.holds) and _somewhere(figures, effect.name)
-        sure = sure and after is None
+        law = _difference_of_law(search, lost, choice)
+        sure = sure and after is None and law is None
+        small = sure and not search.problem.visible(lost[choice])
         found.append(
             EffectVerdict(
                 effect.name,
-                MISSING if sure else POSSIBLE,
+                MINOR if small else MISSING if sure else POSSIBLE,
                 rank,
                 float(np.clip(share, 0.0, 1.0)),
                 figures.wald(effect.name),
                 _either(estimates(figures, effect.name), figures, effect.name, weighed),
                 (*same, *effect.aliases, *also(effect.name)),
-                _add(effect) if sure else _tell(same, effect),
+                _small(scale, share)
+                if small
+                else _add(effect)
+                if sure
+                else _tell(same or ((law,) if law else ()), effect),
                 scale.seen_in,
-                ("" if weighed is None else weighed.told) if after is None else _answered(after),
+                _law(law)
+                if law is not None
+                else _answered(after)
+                if after is not None
+                else ""
+                if weighed is None
+                else weighed.told,
                 confidence=_there(search, current.fit, search.without(current, choice).fit)
                 * (1.0 if weighed is None else weighed.trust)
-                * (1.0 if after is None else ANSWERS),
+                * (1.0 if after is None else ANSWERS)
+                * (1.0 if law is None else 0.5),
             )
         )
     # nobody grants the rotation the slow error that every acceleration has: what is small in it is sure of nothing
@@ -89,6 +106,29 @@ def judge(
     looked = [_absent(search, current, scale, n, stood_for[n], doubtful) for n in absent]
     found = [_over(v, fits) for v, fits in ((v, _left_open(search, current, rivals, v.name)) for v in found)]
     return found, _sharing([v for v, _ in looked], [change for _, change in looked])
+
+
+def _difference_of_law(search: Search, lost: Mapping[Choice, float], choice: Choice) -> str | None:
+    """The effect that `choice` may be told from by the difference between the vehicle's law and the catalogue's alone:
+    it is confounded with `choice` and does more than `1 / LAW` times as much."""
+    effects = search.problem.effects
+    for other, size in lost.items():
+        kin = other.effect in effects[choice.effect].confounded_with
+        kin = kin or choice.effect in effects[other.effect].confounded_with
+        if kin and lost[choice] < LAW**2 * size:
+            return other.effect
+    return None
+
+
+def _law(name: str) -> str:
+    return (
+        f"it does less than a tenth of what {name} does, and may be the difference between the law of {name} here and "
+        "the vehicle's"
+    )
+
+
+def _small(scale: Scale, share: float) -> str:
+    return f"seen, but too small to matter here{scale.told(share)}"
 
 
 def _answered(seconds: float) -> str:
@@ -231,7 +271,7 @@ def _absent(
     if name in search.dropped:
         return verdict(MINOR, extended, (), "it takes nothing away from the error on the held-out flight")
     seen = p < search.significance and share > 0.0
-    small = f"seen, but too small to matter here{scale.told(share)}"
+    small = _small(scale, share)
     minor = seen and there > 0.5 and not doubtful
     return verdict(MINOR if minor else NOT_SUPPORTED, extended, (), small if seen else "")
 

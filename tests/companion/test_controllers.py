@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation, LagInverse, RateModel
@@ -238,6 +238,7 @@ def test_the_trim_does_not_grow_where_the_limits_leave_no_more() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.floats(0.005, 0.08), st.floats(0.02, 0.1), st.floats(0.0, 8.0))
+@example(0, 0.0625, 0.0625, 2.2e-313)
 def test_the_rate_model_tells_what_the_commands_on_their_way_will_do(seed, delay, lag, integral) -> None:
     """Undelayed response minus delayed response, against the ground's own simulation of the same loop."""
     command = np.cumsum(np.random.default_rng(seed).normal(size=(200, 2)), axis=0) * 0.05

@@ -127,7 +127,12 @@ def test_hidden_effect_is_found_and_its_interval_holds_the_truth(folder, name: s
     flight, hidden = flown(folder, name)
     result = diagnosis(flight)
     assert set(result.named("missing")) == ({"rotor_drag", "wind"} if name == "wind" else {name})
-    assert result.named("possible") == ()
+    # one axis of a bias goes with the thrust; the simulator's thrust curve is of another family
+    open_still = {
+        "accelerometer_bias": {"thrust_gain"},
+        "thrust_curve": {"thrust_gain", "accelerometer_bias"},
+    }
+    assert set(result.named("possible")) <= open_still.get(name, set())
     true = effect_named(name).truth(hidden[0].parameters, flight.vehicle)
     found = {parameter.name: parameter for parameter in verdict(result, name).parameters}
     held = [
