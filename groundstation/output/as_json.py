@@ -97,6 +97,8 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
                 "rests_on": e.rests_on,
                 "undetermined": list(e.undetermined),
                 "products": {p.name: interval_table(p) for p in e.products},
+                "changes": [] if e.over_time is None else [asdict(c) for c in e.over_time.changes],
+                "when": "" if e.over_time is None else "; ".join(e.over_time.lines),
                 "over_time": None if e.over_time is None else over_time_table(e.over_time),
             }
             for e in d.effects
