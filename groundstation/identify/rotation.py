@@ -16,14 +16,14 @@ from trueflight.groundstation.identify.adequacy import ABOVE
 from trueflight.groundstation.identify.changes import in_time, in_words, over_time
 from trueflight.groundstation.identify.doubt import Weighing
 from trueflight.groundstation.identify.rotors_apart import doubted
-from trueflight.groundstation.identify.search import Search
+from trueflight.groundstation.identify.search import Search, State, plausible
 from trueflight.groundstation.identify.shares import judge_shares, motor_shares
 from trueflight.groundstation.identify.spans import Values
 from trueflight.groundstation.identify.torque import TorqueProblem, turning_of
-from trueflight.groundstation.identify.verdicts import Scale, by_weight, judge, unmeasured
+from trueflight.groundstation.identify.verdicts import LAW, Scale, by_weight, judge, unmeasured
 from trueflight.groundstation.measured.measurement import measure_rotation
 from trueflight.groundstation.results import EffectVerdict, MotorShares, RotationalRms
-from trueflight.models.effect import Effect, Stage
+from trueflight.models.effect import CENTRE_SHARE, ROTOR_SHARE, Effect, Stage
 from trueflight.models.effects import catalogue
 from trueflight.models.flight import Flight
 from trueflight.models.model import Term
@@ -32,13 +32,15 @@ from trueflight.models.model import Term
 @dataclass(frozen=True)
 class RotationalFindings:
     """What the rotation of a flight says: verdicts, the terms found, and the residual and what each rotor carries where
-    rotors were recorded; `spanned` are the values of those terms that change in flight."""
+    rotors were recorded; `spanned` are the values of those terms that change in flight. `nearly` names, by a centre of
+    mass that was found, weaker rotors that turn the vehicle but for a tenth as it does."""
 
     verdicts: tuple[EffectVerdict, ...]
     terms: tuple[Term, ...]
     rms: RotationalRms | None
     shares: MotorShares | None = None
     spanned: Mapping[str, Values] = field(default_factory=dict)
+    nearly: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def judge_rotation(
@@ -83,7 +85,25 @@ def judge_rotation(
     kept = {v.name for v in verdicts if v.rank is not None}
     spanned = {name: values for name, values in found.fit.spanned.items() if name in kept}
     terms = tuple(t for t in found.fit.terms if t.effect in kept)
-    return RotationalFindings(verdicts, terms, rms, shares, spanned)
+    return RotationalFindings(verdicts, terms, rms, shares, spanned, _nearly(search, found))
+
+
+def _nearly(search: Search, found: State) -> dict[str, tuple[str, ...]]:
+    """By a centre of mass that was found, the weaker rotors that explain the rotation but for `LAW` of what it does."""
+    effects, like = search.problem.effects, {}
+    for choice in found.choices:
+        if effects[choice.effect].in_shares != CENTRE_SHARE or choice.spans:
+            continue
+        without = search.without(found, choice)
+        enough = (1.0 - LAW**2) * (without.fit.sse - found.fit.sse)
+        rotors = [c for c in search.problem.choices if effects[c.effect].in_shares == ROTOR_SHARE]
+        fitted = ((c, search.state((*without.choices, c)).fit) for c in rotors)
+        like[choice.effect] = tuple(
+            dict.fromkeys(
+                c.effect for c, f in fitted if without.fit.sse - f.sse > enough and plausible(f, c.effect)
+            )
+        )
+    return like
 
 
 def that_turns(flight: Flight) -> Flight:

@@ -249,10 +249,44 @@ def _verdicts(
     if unseen:
         rates = [also_possible(v, unseen) if v.verdict == MISSING else v for v in rates]
     rank, turning = len(named), []
-    for verdict in (*rotation.verdicts, *rates):
+    turned: Sequence[EffectVerdict] = rotation.verdicts
+    if _lacks_thrust(problem, found.names, here):
+        turned = or_a_rotor(turned, rotation.nearly)
+    for verdict in (*turned, *rates):
         rank += verdict.rank is not None
         turning.append(replace(verdict, rank=None if verdict.rank is None else rank))
     return [*map(included, base.names()), *named, *by_weight(absent), *others, *turning], terms
+
+
+def _lacks_thrust(problem: ForceProblem, found: Sequence[str], here: Fit) -> bool:
+    """Whether less thrust was found than is believed."""
+    scales = [n for n in found if problem.effects[n].scales_rotors]
+    return any(here.interval(i)[1] < here.free[i].neutral for n in scales for i in here.sizes(n))
+
+
+def or_a_rotor(
+    verdicts: Sequence[EffectVerdict], nearly: Mapping[str, tuple[str, ...]]
+) -> tuple[EffectVerdict, ...]:
+    """Verdicts on the rotation where thrust is lacking, too: one weaker rotor makes both what it is found to lack and
+    `nearly` what a centre of mass does."""
+    open_now = {
+        v.name: nearly.get(v.name, ()) for v in verdicts if v.verdict == MISSING and nearly.get(v.name)
+    }
+    out = []
+    for v in verdicts:
+        others = open_now.get(v.name) or tuple(n for n, rotors in open_now.items() if v.name in rotors)
+        if others:
+            v = replace(
+                v,
+                verdict=POSSIBLE,
+                parameters=v.parameters if v.name in open_now else (),
+                indistinguishable_from=tuple(dict.fromkeys((*v.indistinguishable_from, *others))),
+                rests_on="thrust is lacking, too, and one weaker rotor would make both",
+                advice="compare with a flight when the vehicle was healthy (--healthy FLIGHT)",
+                confidence=None if v.confidence is None else 0.5 * v.confidence,
+            )
+        out.append(v)
+    return tuple(out)
 
 
 def _perhaps_late(

@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from trueflight.groundstation.identify.rotation import judge_rotation
 from trueflight.groundstation.identify.shares import motor_shares
-from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.identify.translation import diagnose, or_a_rotor
+from trueflight.groundstation.identify.verdicts import MISSING, NOT_EXCITED, NOT_SUPPORTED, POSSIBLE
 from trueflight.groundstation.measured.attitude_rate import rate_from_attitude
 from trueflight.groundstation.measured.measurement import measure_rotation
-from trueflight.groundstation.results import EffectVerdict
+from trueflight.groundstation.results import EffectVerdict, ParameterEstimate
 from trueflight.models.allocation import leverage
 from trueflight.models.effects import effect_named
 from trueflight.models.flight import Flight
@@ -172,3 +173,26 @@ def test_gusts_are_not_asked_of_a_flight_that_has_no_attitude() -> None:
     )
     alone = replace(flight, quaternion=None, velocity=None, specific_force=shaken)
     assert diagnose(alone, rigid_body_model(alone.vehicle)).unexplained.verdict
+
+
+def test_a_centre_of_mass_beside_a_lack_of_thrust_may_be_one_weaker_rotor() -> None:
+    """A gentle flight hardly tells a torque in proportion to one rotor's thrust from one in proportion to all."""
+    centre = ParameterEstimate("x", 0.0049, 0.0048, 0.005, "m")
+    beside = ParameterEstimate("loss_2", 0.12, 0.07, 0.17, "1")
+    found = (
+        EffectVerdict(
+            "com_offset", MISSING, 1, 0.97, 0.0, (centre,), (), "add it", "rotation", confidence=1.0
+        ),
+        EffectVerdict("rotor_damage", NOT_SUPPORTED, None, 0.0, 1.0, (beside,), (), "", "rotation"),
+        EffectVerdict("gyroscopic", NOT_EXCITED, None, 0.0, 1.0, (), (), "", "rotation"),
+    )
+    com, rotor, other = or_a_rotor(found, {"com_offset": ("rotor_damage",)})
+    assert (com.verdict, com.indistinguishable_from, com.parameters) == (
+        POSSIBLE,
+        ("rotor_damage",),
+        (centre,),
+    )
+    assert (rotor.verdict, rotor.indistinguishable_from, rotor.parameters) == (POSSIBLE, ("com_offset",), ())
+    assert other == found[2]
+    assert com.confidence == 0.5
+    assert or_a_rotor(found, {"com_offset": ()}) == found
