@@ -105,6 +105,23 @@ def slopes(t: np.ndarray, column: np.ndarray) -> np.ndarray:
     return out
 
 
+def trend(t: np.ndarray, column: np.ndarray, reach: float) -> np.ndarray:
+    """Derivative of a column (N, k) on an even clock `t` (N,): of the straight line through what is within `reach` s
+    before and after (Savitzky & Golay, Anal. Chem. 36, 1964), within each segment. A centimetre of noise at 100 Hz is
+    0.7 m/s between neighbours, and 4 cm/s over a tenth of a second on either side."""
+    out = slopes(t, column)
+    half = round(reach / float(np.median(np.diff(t))))
+    if half < 2:
+        return out
+    k = np.arange(-half, half + 1)
+    weights = k / float(np.sum(k**2)) / float(np.median(np.diff(t)))
+    for part in segments(t):
+        if part.stop - part.start > 2 * half:
+            inner = np.stack([np.correlate(axis, weights, "valid") for axis in column[part].T], axis=-1)
+            out[part] = np.pad(inner, ((half, half), (0, 0)), mode="edge")
+    return out
+
+
 def continuous_quaternion(quaternion: np.ndarray) -> np.ndarray:
     """Quaternions (N, 4) with signs chosen so that neighbours are near each other (q and -q are one
     attitude)."""
