@@ -16,11 +16,11 @@ from trueflight.groundstation.identify.adequacy import ABOVE
 from trueflight.groundstation.identify.changes import in_time, in_words, over_time
 from trueflight.groundstation.identify.doubt import Weighing
 from trueflight.groundstation.identify.rotors_apart import doubted
-from trueflight.groundstation.identify.search import Search, State, plausible
+from trueflight.groundstation.identify.search import LAW, Search, State, plausible
 from trueflight.groundstation.identify.shares import judge_shares, motor_shares
 from trueflight.groundstation.identify.spans import Values
 from trueflight.groundstation.identify.torque import TorqueProblem, turning_of
-from trueflight.groundstation.identify.verdicts import LAW, Scale, by_weight, judge, unmeasured
+from trueflight.groundstation.identify.verdicts import Scale, by_weight, judge, unmeasured
 from trueflight.groundstation.measured.measurement import measure_rotation
 from trueflight.groundstation.results import EffectVerdict, MotorShares, RotationalRms
 from trueflight.models.effect import CENTRE_SHARE, ROTOR_SHARE, Effect, Stage

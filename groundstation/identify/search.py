@@ -44,6 +44,9 @@ STRONG_EVIDENCE = 6.0
 """Twice the log likelihood ratio from which one explanation is told from another (Kass & Raftery 1995)."""
 LINEARISED = 2.0
 """Factor that the linearised gain of an effect is trusted to, before a full fit is saved by it."""
+LAW = 0.1
+"""Part of what an effect does, RMS, by which the law of a vehicle may differ from the catalogue's: a measured thrust
+curve is no parabola, and four rotors near the ground are not one."""
 MOST_EFFECTS = 6
 ACTS = 1e-3
 """Part of the held-out error from which an effect is said to act there."""
@@ -183,7 +186,8 @@ class Search:
     """One search: states are kept by their set of choices, for the steps visit many sets again.
 
     `tried` is the number of candidates that share the risk of a chance find, where it is not that of `problem`;
-    `dropped` are the effects that were left out because the held-out flight does not want them.
+    `dropped` are the effects that were left out because the held-out flight does not want them, `of_another_law` those
+    that may be the difference between the vehicle's law and that of the effect that each names.
     """
 
     def __init__(
@@ -192,6 +196,7 @@ class Search:
         self.problem, self.progress = problem, progress
         self.significance = FAMILY / max(1, len(problem.choices) if tried is None else tried)
         self.dropped: set[str] = set()
+        self.of_another_law: dict[str, str] = {}
         self._states: dict[frozenset[Choice], State] = {}
         self._sets: dict[frozenset[Choice], tuple[State, ...]] = {}
 
@@ -210,7 +215,7 @@ class Search:
         for other in self._other_sets(current):
             if self.evident(other, current) and other.cv_total < current.cv_total:
                 current = other
-        return self.agreed_by_held_out(self._backward(current))
+        return self.agreed_by_held_out(self._of_one_law(self._backward(current)))
 
     def grown(self, current: State) -> State:
         """What the steps end in that begin at `current`."""
@@ -230,7 +235,7 @@ class Search:
 
     def settle(self, choices: Sequence[Choice]) -> State:
         """The fit of `choices`, without those that this flight does not support."""
-        return self.agreed_by_held_out(self._backward(self.state(choices)))
+        return self.agreed_by_held_out(self._of_one_law(self._backward(self.state(choices))))
 
     # --- the steps ------------------------------------------------------------------------------------------
 
@@ -319,6 +324,28 @@ class Search:
         """Whether one of the effects that it acts through is present, if it acts through any."""
         needed = self.problem.effects[choice.effect].acts_through
         return not needed or not set(needed).isdisjoint(present)
+
+    def _of_one_law(self, current: State) -> State:
+        """The state without effects that may be the difference between the vehicle's law and the catalogue's: those
+        that do less than `LAW` of what one does that they are confounded with."""
+        effects = self.problem.effects
+        while True:
+            lost = {c: self.without(current, c).fit.sse - current.fit.sse for c in current.choices}
+            small = [
+                (size, one, other)
+                for one, size in lost.items()
+                for other, much in lost.items()
+                if size < LAW**2 * much
+                and (
+                    other.effect in effects[one.effect].confounded_with
+                    or one.effect in effects[other.effect].confounded_with
+                )
+            ]
+            if not small:
+                return current
+            _, one, other = min(small, key=lambda found: found[0])
+            self.of_another_law[one.effect] = other.effect
+            current = self.without(current, one)
 
     def agreed_by_held_out(self, current: State) -> State:
         """Drop effects that predict the held-out flight no better than the model without them does, where they act

@@ -27,10 +27,6 @@ MISSING, POSSIBLE, MINOR, NOT_SUPPORTED, NOT_EXCITED, INCLUDED = (
 ANSWERS = 0.25
 """Confidence that is left of what comes after what it explains: in seeded hovers in gusts none of it was there."""
 
-LAW = 0.1
-"""Part of what an effect does, RMS, by which the law of a vehicle may differ from the catalogue's: a measured thrust
-curve is no parabola, and four rotors near the ground are not one."""
-
 
 @dataclass(frozen=True)
 class Scale:
@@ -68,8 +64,7 @@ def judge(
             weighed = None
         after = answers(search.problem, figures, effect.name) if scale.seen_in != "rotation" else None
         sure = not same and (weighed is None or weighed.holds) and _somewhere(figures, effect.name)
-        law = _difference_of_law(search, lost, choice)
-        sure = sure and after is None and law is None
+        sure = sure and after is None
         small = sure and not search.problem.visible(lost[choice])
         found.append(
             EffectVerdict(
@@ -80,23 +75,12 @@ def judge(
                 figures.wald(effect.name),
                 _either(estimates(figures, effect.name), figures, effect.name, weighed),
                 (*same, *effect.aliases, *also(effect.name)),
-                _small(scale, share)
-                if small
-                else _add(effect)
-                if sure
-                else _tell(same or ((law,) if law else ()), effect),
+                _small(scale, share) if small else _add(effect) if sure else _tell(same, effect),
                 scale.seen_in,
-                _law(law)
-                if law is not None
-                else _answered(after)
-                if after is not None
-                else ""
-                if weighed is None
-                else weighed.told,
+                ("" if weighed is None else weighed.told) if after is None else _answered(after),
                 confidence=_there(search, current.fit, search.without(current, choice).fit)
                 * (1.0 if weighed is None else weighed.trust)
-                * (1.0 if after is None else ANSWERS)
-                * (1.0 if law is None else 0.5),
+                * (1.0 if after is None else ANSWERS),
             )
         )
     # nobody grants the rotation the slow error that every acceleration has: what is small in it is sure of nothing
@@ -106,18 +90,6 @@ def judge(
     looked = [_absent(search, current, scale, n, stood_for[n], doubtful) for n in absent]
     found = [_over(v, fits) for v, fits in ((v, _left_open(search, current, rivals, v.name)) for v in found)]
     return found, _sharing([v for v, _ in looked], [change for _, change in looked])
-
-
-def _difference_of_law(search: Search, lost: Mapping[Choice, float], choice: Choice) -> str | None:
-    """The effect that `choice` may be told from by the difference between the vehicle's law and the catalogue's alone:
-    it is confounded with `choice` and does more than `1 / LAW` times as much."""
-    effects = search.problem.effects
-    for other, size in lost.items():
-        kin = other.effect in effects[choice.effect].confounded_with
-        kin = kin or choice.effect in effects[other.effect].confounded_with
-        if kin and lost[choice] < LAW**2 * size:
-            return other.effect
-    return None
 
 
 def _law(name: str) -> str:
@@ -268,6 +240,9 @@ def _absent(
         return verdict(POSSIBLE, min(swapped, key=lambda f: f.sse), stands_for, _tell(stands_for, effect))
     if not all(search.excited(current, c, through) for c in own):
         return verdict(NOT_EXCITED, extended, (), f"to see it, fly {effect.manoeuvre}")
+    if other := search.of_another_law.get(name):
+        told, change = verdict(POSSIBLE, extended, (other,), _tell((other,), effect))
+        return replace(told, rests_on=_law(other), confidence=0.5 * there), change
     if name in search.dropped:
         return verdict(MINOR, extended, (), "it takes nothing away from the error on the held-out flight")
     seen = p < search.significance and share > 0.0
