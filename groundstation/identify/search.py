@@ -30,7 +30,7 @@ from trueflight.groundstation.identify.fitting import (
     variance_per_independent_sample,
 )
 from trueflight.groundstation.identify.spans import EVERYWHERE, Span, changes_of, one_change_less
-from trueflight.models.effect import Effect, Parameter
+from trueflight.models.effect import Effect, Parameter, Stage
 
 FAMILY = 0.01
 """Probability that any effect at all is significant by chance, shared by all candidates (Bonferroni)."""
@@ -326,8 +326,8 @@ class Search:
         return not needed or not set(needed).isdisjoint(present)
 
     def _of_one_law(self, current: State) -> State:
-        """The state without effects that may be the difference between the vehicle's law and the catalogue's: those
-        that do less than `LAW` of what one does that they are confounded with."""
+        """The state without effects that may be the difference between the vehicle's law of thrust and the catalogue's:
+        those that do less than `LAW` of what one does whose shape is more than a scale, and that it may be taken for."""
         effects = self.problem.effects
         while True:
             lost = {c: self.without(current, c).fit.sse - current.fit.sse for c in current.choices}
@@ -336,10 +336,9 @@ class Search:
                 for one, size in lost.items()
                 for other, much in lost.items()
                 if size < LAW**2 * much
-                and (
-                    other.effect in effects[one.effect].confounded_with
-                    or one.effect in effects[other.effect].confounded_with
-                )
+                and effects[other.effect].stage is Stage.THRUST
+                and effects[other.effect].generalises
+                and one.effect in effects[other.effect].confounded_with
             ]
             if not small:
                 return current
