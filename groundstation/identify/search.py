@@ -327,7 +327,7 @@ class Search:
 
     def _of_one_law(self, current: State) -> State:
         """The state without effects that may be the difference between the vehicle's law of thrust and the catalogue's:
-        those that do less than `LAW` of what one does whose shape is more than a scale, and that it may be taken for."""
+        those that do less than `LAW` of what one does that is more than a scale, and that may be taken for it."""
         effects = self.problem.effects
         while True:
             lost = {c: self.without(current, c).fit.sse - current.fit.sse for c in current.choices}
