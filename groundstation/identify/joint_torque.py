@@ -18,9 +18,9 @@ from trueflight.groundstation.identify.fitting import (
     robust_covariance,
 )
 from trueflight.groundstation.identify.ownership import BY_FILE, Ownership
-from trueflight.groundstation.identify.search import Choice, State
+from trueflight.groundstation.identify.search import Choice
 from trueflight.groundstation.identify.spans import EVERYWHERE, Span, Value, Values, number
-from trueflight.groundstation.identify.torque import MATERIAL_SIZE, TorqueProblem
+from trueflight.groundstation.identify.torque import OfRotation, TorqueProblem
 from trueflight.groundstation.measured.measurement import Rotation
 from trueflight.groundstation.results import RotationalRms
 from trueflight.models.effect import FLIGHT, Effect, Parameter
@@ -31,7 +31,7 @@ ROUNDS = 12
 
 
 @dataclass(frozen=True)
-class JointTorque:
+class JointTorque(OfRotation):
     """The angular acceleration of several flights: the `Problem` of a search.
 
     `flights` are the same problem of each flight alone; `whose` and `apart` as in `JointForce`.
@@ -206,42 +206,6 @@ class JointTorque:
                     column[rows] = parameter.typical * p.column(name, parameter) * p.weight
             columns.append(column.ravel())
         return np.column_stack(columns)
-
-    def linearised_gain(self, here: Fit, step: tuple[Choice, ...]) -> float:
-        """Reduction of the squared error by the step, at the gains of the control torque found so far."""
-        residual = here.residual.ravel()
-        own = [self.contribution(here, choice) for choice in step]
-        matrix = np.column_stack([here.jacobian.reshape(len(residual), -1), *own])
-        solution = np.linalg.lstsq(matrix.T @ matrix, matrix.T @ residual, rcond=1e-14)[0]
-        return float(residual @ matrix @ solution)
-
-    def beside(self, here: Fit, choice: Choice) -> Fit | None:
-        """None: a fit in full takes no longer."""
-        return None
-
-    def adequate(self, here: Fit) -> bool:
-        """True: with a handful of candidates, each step sees all there is."""
-        return True
-
-    def scale_of_thrust(self, here: Fit) -> None:
-        """None: a gain about each axis is fitted beside every effect."""
-
-    def matters(self, with_: State, without: State, step: tuple[Choice, ...]) -> bool:
-        """Whether each effect of the step has a parameter larger than `MATERIAL_SIZE` of its typical size."""
-
-        def size(name: str) -> float:
-            own = [(with_.fit.estimate[i], with_.fit.free[i]) for i in with_.fit.of(name)]
-            return max(float(abs(x - f.neutral) / abs(f.parameter.typical)) for x, f in own)
-
-        return all(size(c.effect) > MATERIAL_SIZE for c in step)
-
-    def visible(self, energy: float) -> bool:
-        """Whatever the gyroscope sees: what is of interest is told by the size of the parameters."""
-        return True
-
-    def held_out_error(self, fitted: Fit) -> float | None:
-        """None: the rotation is judged on held-out blocks alone."""
-        return None
 
     @property
     def noise(self) -> np.ndarray:

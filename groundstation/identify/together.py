@@ -22,21 +22,16 @@ from trueflight.groundstation.identify.force import MATERIAL_ACCELERATION, mean_
 from trueflight.groundstation.identify.joint_force import JointForce, plain
 from trueflight.groundstation.identify.joint_torque import JointTorque, one_choice_each
 from trueflight.groundstation.identify.ownership import BY_FILE, Ownership
-from trueflight.groundstation.identify.rates import judge_rates
 from trueflight.groundstation.identify.remainder import unexplained
-from trueflight.groundstation.identify.ridges import ridges, with_ridges
 from trueflight.groundstation.identify.rotation import that_turns
 from trueflight.groundstation.identify.rotors import has_rotor_speeds
 from trueflight.groundstation.identify.rotors_apart import doubted
 from trueflight.groundstation.identify.search import Choice, Search, State
 from trueflight.groundstation.identify.spans import Piecewise
 from trueflight.groundstation.identify.torque import TorqueProblem, turning_of
-from trueflight.groundstation.identify.translation import later, seen_as, shown_by_rotors
+from trueflight.groundstation.identify.translation import judged, later, seen_elsewhere, shown_by_rotors
 from trueflight.groundstation.identify.verdicts import (
-    MISSING,
-    NOT_EXCITED,
     Scale,
-    also_possible,
     by_weight,
     included,
     judge,
@@ -360,32 +355,9 @@ class _Joint:
     ) -> tuple[list[EffectVerdict], list[Term]]:
         """The verdicts on all effects of the catalogue, and the terms of what the body rates show."""
         problem, base = _joint(search), self.base
-        before = problem.mean_square_before
-        scale = Scale(
-            before * problem.samples, lambda share: f": {np.sqrt(max(share, 0.0) * before):.3f} m/s² RMS"
-        )
-        named, absent = judge(search, found, here, scale, lambda name: seen_as(problem, name, here), doubt)
-        named = with_ridges(named, ridges(entire, here, found.names))
-        candidates = {c.effect for c in problem.choices}
-        others = [
-            unmeasured(e, e.lacks(problem.flight))
-            for n, e in problem.effects.items()
-            if n not in candidates and n not in base.names() and not e.rotational
-        ]
-        rates, terms = judge_rates(
-            self.all[-1], base.names(), base.effects_directory, later(problem, found.names, here)
-        )
-        unseen = tuple(
-            v.name
-            for v in absent
-            if v.verdict == NOT_EXCITED and problem.effects[v.name].stage is Stage.COMMAND
-        )
-        if unseen:
-            rates = [also_possible(v, unseen) if v.verdict == MISSING else v for v in rates]
-        rank, turning = len(named), []
-        for verdict in (*rotation.verdicts, *rates):
-            rank += verdict.rank is not None
-            turning.append(replace(verdict, rank=None if verdict.rank is None else rank))
+        named, absent = judged(search, found, here, entire, doubt)
+        late = later(problem, found.names, here)
+        others, turning, terms = seen_elsewhere(problem, named, absent, rotation.verdicts, self.all[-1], late)
         seen = [self._by_name(v) for v in (*named, *by_weight(absent))]
         return [*map(included, base.names()), *seen, *others, *turning], terms
 

@@ -170,8 +170,53 @@ def _as_late_as_it_acts(
     return acting(delay, tau), (delay, tau)
 
 
+class OfRotation:
+    """What every search in the rotation answers alike, of one flight or of several: a handful of candidates, linear in
+    their sizes but for the gain of the control torque, and no held-out flight."""
+
+    def contribution(self, here: Fit, choice: Choice, through: str | None = None) -> np.ndarray:
+        """As in `identify.search.Problem`."""
+        raise NotImplementedError
+
+    def linearised_gain(self, here: Fit, step: tuple[Choice, ...]) -> float:
+        """Reduction of the squared error by the step, at the gains of the control torque found so far."""
+        residual = here.residual.ravel()
+        own = [self.contribution(here, choice) for choice in step]
+        matrix = np.column_stack([here.jacobian.reshape(len(residual), -1), *own])
+        solution = np.linalg.lstsq(matrix.T @ matrix, matrix.T @ residual, rcond=1e-14)[0]
+        return float(residual @ matrix @ solution)
+
+    def beside(self, here: Fit, choice: Choice) -> Fit | None:
+        """None: a fit in full takes no longer."""
+        return None
+
+    def adequate(self, here: Fit) -> bool:
+        """True: with a handful of candidates, each step sees all there is."""
+        return True
+
+    def scale_of_thrust(self, here: Fit) -> None:
+        """None: a gain about each axis is fitted beside every effect."""
+
+    def matters(self, with_: State, without: State, step: tuple[Choice, ...]) -> bool:
+        """Whether each effect of the step has a parameter larger than `MATERIAL_SIZE` of its typical size."""
+
+        def size(name: str) -> float:
+            own = [(with_.fit.estimate[i], with_.fit.free[i]) for i in with_.fit.of(name)]
+            return max(float(abs(x - f.neutral) / abs(f.parameter.typical)) for x, f in own)
+
+        return all(size(c.effect) > MATERIAL_SIZE for c in step)
+
+    def visible(self, energy: float) -> bool:
+        """Whatever the gyroscope sees: what is of interest is told by the size of the parameters."""
+        return True
+
+    def held_out_error(self, fitted: Fit) -> float | None:
+        """None: the rotation is judged on held-out blocks alone."""
+        return None
+
+
 @dataclass(frozen=True)
-class TorqueProblem:
+class TorqueProblem(OfRotation):
     """The angular acceleration of a flight against its rotors' torque and more effects: the `Problem` of a search.
 
     `effects` are all that act on the torque, `included` those of the model, `candidates` those that may be missing;
@@ -303,42 +348,6 @@ class TorqueProblem:
             for p, span in self._own(choice)
         )
         return np.column_stack([c.ravel() for c in columns])
-
-    def linearised_gain(self, here: Fit, step: tuple[Choice, ...]) -> float:
-        """Reduction of the squared error by the step, at the gains of the control torque found so far."""
-        residual = here.residual.ravel()
-        own = [self.contribution(here, choice) for choice in step]
-        matrix = np.column_stack([here.jacobian.reshape(len(residual), -1), *own])
-        solution = np.linalg.lstsq(matrix.T @ matrix, matrix.T @ residual, rcond=1e-14)[0]
-        return float(residual @ matrix @ solution)
-
-    def beside(self, here: Fit, choice: Choice) -> Fit | None:
-        """None: a fit in full takes no longer."""
-        return None
-
-    def adequate(self, here: Fit) -> bool:
-        """True: with a handful of candidates, each step sees all there is."""
-        return True
-
-    def scale_of_thrust(self, here: Fit) -> None:
-        """None: a gain about each axis is fitted beside every effect."""
-
-    def matters(self, with_: State, without: State, step: tuple[Choice, ...]) -> bool:
-        """Whether each effect of the step has a parameter larger than `MATERIAL_SIZE` of its typical size."""
-
-        def size(name: str) -> float:
-            own = [(with_.fit.estimate[i], with_.fit.free[i]) for i in with_.fit.of(name)]
-            return max(float(abs(x - f.neutral) / abs(f.parameter.typical)) for x, f in own)
-
-        return all(size(c.effect) > MATERIAL_SIZE for c in step)
-
-    def visible(self, energy: float) -> bool:
-        """Whatever the gyroscope sees: what is of interest is told by the size of the parameters."""
-        return True
-
-    def held_out_error(self, fitted: Fit) -> float | None:
-        """None: the rotation is judged on held-out blocks alone."""
-        return None
 
     def rms(self, before: Fit, after: Fit) -> RotationalRms:
         """Residual of the rotors' torque alone, and of what was found, rad/s² over all axes."""

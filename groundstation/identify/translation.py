@@ -225,37 +225,63 @@ def _verdicts(
 ) -> tuple[list[EffectVerdict], list[Term]]:
     """The verdicts on all effects of the catalogue, and the terms of what the body rates show."""
     problem, base = _force(search), entire.base
+    named, absent = judged(search, found, here, entire, doubt)
+    named = [_perhaps_late(search, found, entire, here, v) for v in named]
+    both = with_shares([*named, *absent], shares(entire, here, found.names))
+    named, absent = both[: len(named)], both[len(named) :]
+    turned: Sequence[EffectVerdict] = rotation.verdicts
+    if _lacks_thrust(problem, found.names, here):
+        turned = or_a_rotor(turned, rotation.nearly)
+    late = later(problem, found.names, here)
+    others, turning, terms = seen_elsewhere(problem, named, absent, turned, entire.flight, late)
+    return [*map(included, base.names()), *named, *by_weight(absent), *others, *turning], terms
+
+
+def judged(
+    search: Search, found: State, here: Fit, entire: ForceProblem, doubt: Weighing | None
+) -> tuple[list[EffectVerdict], list[EffectVerdict]]:
+    """Verdicts on what was found in the acceleration, and on what was not."""
+    problem = _force(search)
     before = problem.mean_square_before
     scale = Scale(
         before * problem.samples, lambda share: f": {np.sqrt(max(share, 0.0) * before):.3f} m/s² RMS"
     )
     named, absent = judge(search, found, here, scale, lambda name: seen_as(problem, name, here), doubt)
-    named = with_ridges(named, ridges(entire, here, found.names))
-    named = [_perhaps_late(search, found, entire, here, v) for v in named]
-    both = with_shares([*named, *absent], shares(entire, here, found.names))
-    named, absent = both[: len(named)], both[len(named) :]
+    return with_ridges(named, ridges(entire, here, found.names)), absent
+
+
+def seen_elsewhere(
+    problem: ForceProblem,
+    named: Sequence[EffectVerdict],
+    absent: Sequence[EffectVerdict],
+    turned: Sequence[EffectVerdict],
+    flight: Flight,
+    late: float,
+) -> tuple[list[EffectVerdict], list[EffectVerdict], list[Term]]:
+    """Verdicts on what the flights have no measurements for, and on the rotation and the rate loop, ranked after those
+    that are `named`; and the terms of the rate loop.
+
+    `turned` are the verdicts on the rotation, `flight` is the one whose rate loop is judged, `late` s are granted to
+    it: rotors found to follow their command later than believed.
+    """
+    base = problem.base
     candidates = {c.effect for c in problem.choices}
     others = [
         unmeasured(e, e.lacks(problem.flight))
         for n, e in problem.effects.items()
         if n not in candidates and n not in base.names() and not e.rotational
     ]
-    rates, terms = judge_rates(
-        entire.flight, base.names(), base.effects_directory, later(problem, found.names, here)
-    )
+    rates, terms = judge_rates(flight, base.names(), base.effects_directory, late)
     unseen = tuple(
         v.name for v in absent if v.verdict == NOT_EXCITED and problem.effects[v.name].stage is Stage.COMMAND
     )
     if unseen:
         rates = [also_possible(v, unseen) if v.verdict == MISSING else v for v in rates]
     rank, turning = len(named), []
-    turned: Sequence[EffectVerdict] = rotation.verdicts
-    if _lacks_thrust(problem, found.names, here):
-        turned = or_a_rotor(turned, rotation.nearly)
     for verdict in (*turned, *rates):
         rank += verdict.rank is not None
         turning.append(replace(verdict, rank=None if verdict.rank is None else rank))
-    return [*map(included, base.names()), *named, *by_weight(absent), *others, *turning], terms
+    return others, turning, terms
 
 
 def _lacks_thrust(problem: ForceProblem, found: Sequence[str], here: Fit) -> bool:
