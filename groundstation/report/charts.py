@@ -53,7 +53,7 @@ def waterfall(steps: Sequence[Table], colours: Colours = COLOURS) -> Drawing:
     ax.invert_yaxis()
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("residual RMS, m/s²")
-    ax.legend(loc="lower right")
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2)
     told = "; ".join(
         f"{s['label']} {s['fitted']:.3f}" + (f", held out {s['held_out']:.3f}" if held else "") for s in steps
     )
