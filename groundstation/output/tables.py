@@ -110,9 +110,9 @@ def print_waterfall(
     """The error falling over the model versions, with bars."""
     table = Table(title="residual RMS in m/s² as effects are added", title_justify="left")
     table.add_column("model", no_wrap=True)
-    table.add_column(f"fitted: {fitted}", justify="right")
+    table.add_column(f"fitted: {fitted}", justify="right", overflow="fold")
     if held_out:
-        table.add_column(f"held out: {held_out}", justify="right")
+        table.add_column(f"held out: {held_out}", justify="right", overflow="fold")
     table.add_column("", no_wrap=True)
     most = max(s.fitted for s in steps)
     for s in steps:
