@@ -205,6 +205,30 @@ def test_a_light_process_loads_no_heavy_library(module: str) -> None:
     assert out.stdout.strip() == "[]"
 
 
+def loaded_by(*arguments: str) -> set[str]:
+    """The modules that `groundstation` has loaded when it ends."""
+    import subprocess
+
+    code = (
+        "import sys\n"
+        "from trueflight.groundstation.commands.app import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print('loaded', *sys.modules)\n"
+    )
+    out = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    return set(out.stdout.splitlines()[-1].split()[1:])
+
+
+def test_the_programs_help_loads_no_command() -> None:
+    loaded = loaded_by("--help")
+    commands = {m for m in loaded if m.startswith("trueflight.groundstation.")}
+    assert commands == {f"trueflight.groundstation.commands{m}" for m in ("", ".app", ".tasks", ".choosing")}
+    assert not loaded & {"numpy", "pydantic", "trueflight.models.flight"}
+
+
 def test_a_diagnosis_begins_without_what_it_may_not_need() -> None:
     import subprocess
 

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import programs
 import pytest
+import typer
 
 from trueflight import __version__
-from trueflight.groundstation.commands.app import TASKS, app
+from trueflight.groundstation.commands.app import app
+from trueflight.groundstation.commands.tasks import TASKS
 
 BIN = Path(sys.executable).parent
 WITHOUT = """
@@ -30,12 +32,15 @@ def test_every_program_tells_its_version(program: str) -> None:
     assert (told.returncode, told.stdout) == (0, f"{program} {__version__}\n")
 
 
-def test_every_command_stands_under_a_task() -> None:
-    known = {c.name for c in app.registered_commands} | {g.name for g in app.registered_groups}
-    told = [name for names in TASKS.values() for name in names]
-    assert sorted(told) == sorted(known)
+def test_every_command_stands_under_a_task_with_its_own_words() -> None:
+    made = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    told = {name: entry.told for entries in TASKS.values() for name, entry in entries.items()}
+    assert told == {name: " ".join(made[name].help.split("\n\n")[0].split()) for name in made}
     page = programs.run("groundstation", "--help").stdout
     assert sorted(TASKS, key=lambda task: page.index(f"─ {task} ─")) == list(TASKS)
+    modules = (Path(__file__).parents[1] / "groundstation" / "commands").glob("*.py")
+    registering = {m.stem for m in modules if "\ndef register(" in m.read_text()}
+    assert registering == {entry.module for entries in TASKS.values() for entry in entries.values()}
 
 
 def test_in_the_companions_environment_it_says_what_to_install() -> None:
