@@ -59,11 +59,14 @@ def run_command_line(app: Callable[[], object], extra: str = "all") -> None:
         _end("not enough memory; give fewer or shorter files")
 
 
-def _end(message: str) -> None:
+def plain_line(message: str) -> str:
+    """A message as one line of printable characters, of a length that can be read."""
     line = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in " ".join(message.split()))
-    if len(line) > _LONGEST:
-        line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
-    print(f"error: {line}", file=sys.stderr)  # noqa: T201
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
+
+
+def _end(message: str) -> None:
+    print(f"error: {plain_line(message)}", file=sys.stderr)  # noqa: T201
     raise SystemExit(2) from None
 
 

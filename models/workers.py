@@ -17,7 +17,7 @@ def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
     hang. At the end of the block work under way is finished and the rest is dropped. A request to end (SIGTERM) is a
     KeyboardInterrupt inside the block, so that it takes the same orderly way. Hand out the work inside
     `interrupts_held`, or a worker that still starts may be interrupted."""
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _serve_parent)
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), serve_parent)
     with _ended_as_interrupted():
         try:
             yield pool
@@ -56,8 +56,9 @@ def _ended_as_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _serve_parent() -> None:
-    """In the worker: end when the parent does; what was half-written is removed by the next run."""
+def serve_parent() -> None:
+    """In a worker: end when its parent does, and leave interrupts to it; what was half-written is removed by the next
+    run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     parent = parent_process()

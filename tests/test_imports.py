@@ -17,7 +17,7 @@ ALLOWED = {
     "groundstation": {
         "trueflight.groundstation", "torch", "control", "scipy", "rerun", "pyarrow", "pyulog", "pymavlink", "rosbags",
         "onnx", "onnxruntime", "mcap", "mcap_ros2", "zstandard", "google", "zenoh", "jinja2", "markupsafe",
-        "matplotlib", "pandas", "dask", "distributed", "cryptography", "threadpoolctl", "sympy",
+        "matplotlib", "pandas", "dask", "distributed", "cryptography", "threadpoolctl", "sympy", "starlette", "uvicorn",
     },
     "sim_bridge": {
         "trueflight.sim_bridge", "trueflight.companion", "mujoco", "pymavlink", "scipy", "mcap", "google",
@@ -55,9 +55,12 @@ ROOMS: dict[str, set[str]] = {
         "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",
         "report", "export",
     },
+    "workbench": {
+        "results", "reading", "identify", "evaluate", "versions", "output", "views", "report", "operate",
+    },
     "commands": {
         "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",
-        "views", "report", "study", "export",
+        "views", "report", "study", "export", "workbench",
     },
 }  # fmt: skip
 """The rooms of groundstation/ from the bottom to the top, and what each may import: only what stands above it here."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -46,15 +44,14 @@ def demo_command(
 
     Example: groundstation demo --seed 7
     """
-    from trueflight.groundstation.operate.processes import program
+    from trueflight.groundstation.operate.processes import has_display, program
     from trueflight.groundstation.study.demonstration import demonstrate
 
     audience = _Terminal()
     outcome = demonstrate(output, QUAD5, seed, hidden or [], audience)
     audience.step("Before and after", str(output))
     _print_outcome(outcome)
-    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"
-    if viewer and screen:
+    if viewer and has_display():
         subprocess.Popen([program("rerun"), *map(str, outcome.recordings)], start_new_session=True)
     if real:
         show_real_flights()

@@ -22,6 +22,10 @@ class Entry(NamedTuple):
 
 TASKS: dict[str, dict[str, Entry]] = {
     "Begin here": {
+        "open": Entry(
+            "open",
+            "Open the workbench: compare, see where the model fails, add what is missing, watch the error fall.",
+        ),
         "demo": Entry(
             "demo",
             "The main job end to end on a simulated vehicle with a hidden effect, then on real flights.",

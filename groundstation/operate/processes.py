@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -24,6 +25,11 @@ def program(name: str) -> str:
     """A program of this installation: beside the interpreter, or on the path."""
     beside = Path(sys.executable).parent / name
     return str(beside) if beside.exists() else name
+
+
+def has_display() -> bool:
+    """Whether a window can be shown here."""
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")) or sys.platform == "darwin"
 
 
 def run_json(command: Sequence[object]) -> dict[str, Any]:

@@ -33,6 +33,10 @@ ENDINGS = (*RECORDS, *TABLES, *ULOGS, *DATAFLASH, *TELEMETRY)
 """Best first: of files of a folder that differ in their ending only, the first of these is read."""
 
 
+class NoVehicle(InputError):
+    """A flight without the file of its vehicle."""
+
+
 def read_flight(
     path: str | Path, vehicle: str | Path | Vehicle | None = None, mapping: Given = None
 ) -> Flight:
@@ -169,7 +173,7 @@ def _vehicle(path: Path, vehicle: str | Path | Vehicle | None) -> Vehicle:
         if path.suffix.lower() in (*ULOGS, *DATAFLASH, *TELEMETRY)
         else ""
     )
-    raise InputError(
+    raise NoVehicle(
         f"{path}: no vehicle.toml beside it; pass --vehicle FILE (mass, hover_thrust and rotors as you "
         f"believe them){draft}"
     )

@@ -17,6 +17,7 @@ from trueflight.groundstation.evaluate.tracking import Tracking
 from trueflight.groundstation.output.cited import unit
 from trueflight.groundstation.report.svg import BESIDE, COLOURS, LEVELS, Colours, Drawing, figure, level
 from trueflight.groundstation.results import Comparison, EffectVerdict, Moment
+from trueflight.models.trajectory import Trajectory
 
 WIDTH = 7.4
 WINDOW = 12.0
@@ -363,3 +364,26 @@ def beside_over_time(beside: SideBySide, colours: Colours = COLOURS) -> Drawing:
         "besidetime",
         f"Residual RMS over {SMOOTHING:g} s of {' and '.join(beside.names)} along the flight.",
     )
+
+
+def planned(trajectory: Trajectory, colours: Colours = COLOURS) -> Drawing:
+    """A planned flight: from above, from the south, and its speed over time; home frame."""
+    t = np.linspace(0.0, trajectory.duration, MOST)
+    c = trajectory.sample(t)
+    made, axes = figure(1, 3, WIDTH, 2.7)
+    for ax, (across, up), names in (
+        (axes[0, 0], (0, 1), ("x, m", "y, m")),
+        (axes[0, 1], (0, 2), ("x, m", "height, m")),
+    ):
+        ax.plot(c.position[:, across], c.position[:, up], color=colours["after"], linewidth=1.3)
+        ax.plot(*c.position[0, [across, up]], marker="o", color=colours["ink"], markersize=5)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_xlabel(names[0])
+        ax.set_ylabel(names[1])
+    axes[0, 0].set_title("from above")
+    axes[0, 1].set_title("from the side")
+    axes[0, 2].plot(t, np.linalg.norm(c.velocity, axis=1), color=colours["after"], linewidth=1.1)
+    axes[0, 2].set_xlabel("time, s")
+    axes[0, 2].set_ylabel("speed, m/s")
+    axes[0, 2].set_ylim(bottom=0.0)
+    return Drawing(made, "planned", f"The planned flight of {trajectory.duration:.0f} s: path and speed.")

@@ -1,0 +1,66 @@
+// Rerun's web viewer, in a frame of ours: a recording shown, its time moved.
+"use strict";
+
+const TIMELINE = "flight_time";
+const canvas = document.getElementById("canvas");
+const state = document.getElementById("state");
+let handle = null;
+let channel = 0;
+
+/** A protobuf field of wire type 2: bytes. */
+function field(number, bytes) {
+  return [(number << 3) | 2, ...varint(bytes.length), ...bytes];
+}
+
+function varint(value) {
+  const out = [];
+  for (let rest = BigInt.asUintN(64, BigInt(value)); ; rest >>= 7n) {
+    if (rest < 128n) return [...out, Number(rest)];
+    out.push(Number(rest & 127n) | 128);
+  }
+}
+
+/** The viewer-control request of Rerun that moves the time cursor: seconds of the flight's own clock. */
+function setTime(seconds) {
+  const timeline = field(1, [...new TextEncoder().encode(TIMELINE)]);
+  const time = [8, ...varint(Math.round(seconds * 1e9))];
+  return new Uint8Array(field(6, [...field(2, timeline), ...field(3, time)]));
+}
+
+async function moveTo(seconds) {
+  await handle.viewer_control(setTime(seconds));
+  window.parent.postMessage({ at: seconds }, location.origin);
+}
+
+window.showRecording = async (url) => {
+  const answer = await fetch(url);
+  if (!answer.ok) return void (state.textContent = "this recording is no longer there");
+  const bytes = new Uint8Array(await answer.arrayBuffer());
+  if (channel) handle.close_channel(`recording-${channel}`);
+  channel += 1;
+  handle.open_channel(`recording-${channel}`, "trueflight");
+  handle.send_rrd_to_channel(`recording-${channel}`, bytes);
+  setTimeout(() => window.parent.postMessage("ready", location.origin), 300);
+};
+
+async function begin() {
+  if (typeof wasm_bindgen === "undefined") throw new Error("the viewer's files are not there");
+  await wasm_bindgen("/viewer/re_viewer_bg.wasm");
+  handle = new wasm_bindgen.WebHandle({
+    url: [], manifest_url: null, render_backend: null, video_decoder: null, hide_welcome_screen: true,
+    enable_history: false, notebook: false, persist: false, theme: "system",
+  });
+  await handle.start(canvas);
+  state.hidden = true;
+  await window.showRecording(document.body.dataset.recording);
+}
+
+window.addEventListener("message", (event) => {
+  if (event.origin !== location.origin || handle === null) return;
+  if (typeof event.data?.seconds === "number") moveTo(event.data.seconds).catch((error) => console.warn(String(error)));
+});
+
+begin().catch((error) => {
+  state.hidden = false;
+  state.textContent = `the viewer does not start here: ${error}`;
+});
