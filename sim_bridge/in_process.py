@@ -22,16 +22,18 @@ from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS
 from trueflight.models.record import FlightRecorder
 from trueflight.models.record_pb2 import Event, Tick
-from trueflight.models.trajectory import ReferenceSample, Trajectory, transfer
+from trueflight.models.trajectory import ReferenceSample, Trajectory
 from trueflight.models.whole_file import whole_file
-from trueflight.sim_bridge.plan import Plan
+from trueflight.sim_bridge.plan import Plan, legs_of
 from trueflight.sim_bridge.simulator import Simulator
 from trueflight.sim_bridge.truth.sensors import Estimate
 from trueflight.sim_bridge.world import PHYSICS_STEP
 
-_LOST = 4.0  # m from the reference at which a flight is given up, as the companion does
-_BETWEEN_SPEED, _BETWEEN_ACCELERATION = 1.5, 2.0  # m/s, m/s²: from the end back to the start
-_TICK_EVENT_LEVELS = {"finished": "info", "lost": "error", "crashed": "error"}
+LOST = 4.0
+"""m from the reference at which a flight is given up, as the companion does."""
+FALLEN = 0.6
+"""Share of the standing height below which a vehicle that touches the ground lies on its side or its back."""
+OUTCOME_LEVELS = {"finished": "info", "lost": "error", "crashed": "error"}
 
 
 class Sample(NamedTuple):
@@ -110,12 +112,12 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
         squares[0] += ex * ex
         squares[1] += ey * ey
         squares[2] += ez * ez
-        if ex * ex + ey * ey + ez * ez > _LOST * _LOST:
+        if ex * ex + ey * ey + ez * ez > LOST * LOST:
             outcome = "lost"
             break
         if simulator.world.touching:
             touching += 1
-            if pz < 0.6 * ground:  # on its side or its back
+            if pz < FALLEN * ground:
                 outcome = "crashed"
                 break
         command = control.thrust_command
@@ -158,15 +160,7 @@ def _guard(plan: Plan) -> Guard | None:
 
 def _previews(plan: Plan, period: float) -> Iterator[Preview]:
     """The reference ahead of each tick: the trajectory as often as asked, with a transfer from end to start between."""
-    trajectory = plan.trajectory
-    back = None
-    if math.dist(trajectory.end, trajectory.start) > 1e-6:
-        back = transfer(trajectory.end, trajectory.start, _BETWEEN_SPEED, _BETWEEN_ACCELERATION)
-    legs = []
-    for turn in range(plan.repeat):
-        if turn and back is not None:
-            legs.append(back)
-        legs.append(trajectory)
+    trajectory, legs = plan.trajectory, legs_of(plan)
     offset, tick = plan.settle, 0
     while tick * period < plan.settle - 1e-9:
         yield partial(_ahead, trajectory, tick * period - plan.settle)
@@ -222,7 +216,7 @@ def _write_record(plan: Plan, tick: _TickWriter, flown: Flown, path: Path) -> No
     try:
         for message, time_us, host in tick.messages:
             recorder.tick(message, time_us, host)
-        level = _TICK_EVENT_LEVELS[flown.outcome]
+        level = OUTCOME_LEVELS[flown.outcome]
         recorder.event(
             Event(vehicle_time_us=tick.time_us, level=level, kind=flown.outcome, text=flown.outcome)
         )

@@ -12,13 +12,15 @@ from trueflight.models.contract import CORRECTED, LQR
 from trueflight.models.design import Design, load_design
 from trueflight.models.errors import InputError
 from trueflight.models.reference import trajectory, trajectory_from_csv
-from trueflight.models.trajectory import Trajectory
+from trueflight.models.trajectory import Trajectory, transfer
 from trueflight.models.vehicle import Vehicle
 from trueflight.sim_bridge.settings import Settings
 from trueflight.sim_bridge.truth.battery import FULL, BatteryState
 from trueflight.sim_bridge.truth.hidden import Hidden
 from trueflight.sim_bridge.truth.sensors import Noise
 from trueflight.sim_bridge.world import PHYSICS_STEP
+
+_BETWEEN_SPEED, _BETWEEN_ACCELERATION = 1.5, 2.0  # m/s, m/s²: from the end back to the start
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,21 @@ class Plan:
                 f"--rate {self.rate:g}: must divide the physics rate of {physics} Hz (50, 100, 250, 500)"
             )
         return round(steps)
+
+
+def legs_of(plan: Plan) -> list[Trajectory]:
+    """What a flight flies after it has settled: the trajectory as often as asked, with a transfer from its end to its
+    start between."""
+    trajectory = plan.trajectory
+    back = None
+    if math.dist(trajectory.end, trajectory.start) > 1e-6:
+        back = transfer(trajectory.end, trajectory.start, _BETWEEN_SPEED, _BETWEEN_ACCELERATION)
+    legs = []
+    for turn in range(plan.repeat):
+        if turn and back is not None:
+            legs.append(back)
+        legs.append(trajectory)
+    return legs
 
 
 def design_of(settings: Settings, vehicle: Vehicle) -> Design:

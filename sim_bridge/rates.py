@@ -37,40 +37,40 @@ class Mixer:
             for (x, y, _), direction in zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True)
         ]
         inverse = np.linalg.inv(np.array(rows).T)
-        self._rows: tuple[tuple[float, float, float, float], ...] = tuple(
+        self.rows: tuple[tuple[float, float, float, float], ...] = tuple(
             (float(a), float(b), float(c), float(d)) for a, b, c, d in inverse
         )
-        self._hover = vehicle.hover_thrust
-        self._linear = vehicle.thrust_model == "linear"
-        self._top = 1.0 / self._hover if self._linear else 1.0 / self._hover**2
+        self.hover = vehicle.hover_thrust
+        self.linear = vehicle.thrust_model == "linear"
+        self.top = 1.0 / self.hover if self.linear else 1.0 / self.hover**2
         self.saturated = False
 
     def relative(self, command: float) -> float:
         """Believed thrust over hover thrust of a normalised collective command."""
-        ratio = command / self._hover
-        return ratio if self._linear else ratio * ratio
+        ratio = command / self.hover
+        return ratio if self.linear else ratio * ratio
 
     def mix(self, collective: float, roll: float, pitch: float, yaw: float) -> list[float]:
         """Four motor commands, 0 to 1, for a thrust relative to hover and torques in N m."""
-        (a0, b0, c0, d0), (a1, b1, c1, d1), (a2, b2, c2, d2), (a3, b3, c3, d3) = self._rows
+        (a0, b0, c0, d0), (a1, b1, c1, d1), (a2, b2, c2, d2), (a3, b3, c3, d3) = self.rows
         t0 = a0 * collective + b0 * roll + c0 * pitch + d0 * yaw
         t1 = a1 * collective + b1 * roll + c1 * pitch + d1 * yaw
         t2 = a2 * collective + b2 * roll + c2 * pitch + d2 * yaw
         t3 = a3 * collective + b3 * roll + c3 * pitch + d3 * yaw
-        top = self._top
+        top = self.top
         low = IDLE_SHARE
         self.saturated = not (low <= t0 <= top and low <= t1 <= top and low <= t2 <= top and low <= t3 <= top)
         if self.saturated:
-            t0, t1, t2, t3 = self._give_way(collective, roll, pitch, yaw)
-        hover = self._hover
-        if self._linear:
+            t0, t1, t2, t3 = self.give_way(collective, roll, pitch, yaw)
+        hover = self.hover
+        if self.linear:
             return [hover * t0, hover * t1, hover * t2, hover * t3]
         return [hover * t0**0.5, hover * t1**0.5, hover * t2**0.5, hover * t3**0.5]
 
-    def _give_way(self, collective: float, roll: float, pitch: float, yaw: float) -> list[float]:
-        low, top = IDLE_SHARE, self._top
-        tilt = [b * roll + c * pitch for _, b, c, _ in self._rows]
-        turn = [d * yaw for _, _, _, d in self._rows]
+    def give_way(self, collective: float, roll: float, pitch: float, yaw: float) -> list[float]:
+        low, top = IDLE_SHARE, self.top
+        tilt = [b * roll + c * pitch for _, b, c, _ in self.rows]
+        turn = [d * yaw for _, _, _, d in self.rows]
         span = max(tilt) - min(tilt)
         if span > top - low:
             tilt = [share * (top - low) / span for share in tilt]
@@ -116,13 +116,13 @@ class RateController:
         arm = believed_powertrain(vehicle).torque_per_thrust
         yaw_acceleration = arm * vehicle.mass * GRAVITY / izz
         yaw_crossover = min(0.35 * crossover, 0.6 * yaw_acceleration)
-        self._gains = (
+        self.gains = (
             (crossover * ixx, _INTEGRAL * crossover * ixx, 0.006 * crossover * ixx),
             (crossover * iyy, _INTEGRAL * crossover * iyy, 0.006 * crossover * iyy),
             (yaw_crossover * izz, _YAW_INTEGRAL * yaw_crossover * izz, 0.0),
         )
-        self._limits = (2.0 * crossover * ixx, 2.0 * crossover * iyy, 0.5 * yaw_acceleration * izz)
-        self._smooth = 1.0 - math.exp(-2 * math.pi * 30.0 * dt)
+        self.limits = (2.0 * crossover * ixx, 2.0 * crossover * iyy, 0.5 * yaw_acceleration * izz)
+        self.smooth = 1.0 - math.exp(-2 * math.pi * 30.0 * dt)
         self.reset()
 
     def reset(self) -> None:
@@ -138,8 +138,8 @@ class RateController:
         r.
         """
         dt = self.dt
-        (kp, ki, kd), (kp2, ki2, kd2), (kp3, ki3, _) = self._gains
-        smooth = self._smooth
+        (kp, ki, kd), (kp2, ki2, kd2), (kp3, ki3, _) = self.gains
+        smooth = self.smooth
         dp = self._dp = self._dp + smooth * ((p - self._p) / dt - self._dp)
         dq = self._dq = self._dq + smooth * ((q - self._q) / dt - self._dq)
         self._p = p
@@ -154,7 +154,7 @@ class RateController:
         )
         if not mixer.saturated:
             # Comparisons instead of min and max: this runs 500 times a simulated second.
-            lp, lq, lr = self._limits
+            lp, lq, lr = self.limits
             i = self._ip + ki * ep * dt
             self._ip = i if -lp < i < lp else (lp if i > 0 else -lp)
             i = self._iq + ki2 * eq * dt

@@ -21,7 +21,7 @@ from trueflight.sim_bridge.truth.sensors import Estimate, Noise, Sensors
 from trueflight.sim_bridge.world import PHYSICS_STEP, World
 
 _STEP_US = round(PHYSICS_STEP * 1e6)
-_LEFT_GROUND = 0.05  # m above standing at which the time after take-off begins
+LEFT_GROUND = 0.05  # m above standing at which the time after take-off begins
 
 Moment = tuple[
     int, list[float], list[float], tuple[float, float, float], tuple[float, ...], float, Sequence[float]
@@ -223,7 +223,7 @@ class Simulator:
         """Let happen what happens at a time after take-off; the clock starts when the vehicle leaves the
         ground.
         """
-        if not self._flying_steps and self._position[2] < self.world.standing_height + _LEFT_GROUND:
+        if not self._flying_steps and self._position[2] < self.world.standing_height + LEFT_GROUND:
             return
         self._flying_steps += 1
         airborne = self._flying_steps * PHYSICS_STEP

@@ -17,6 +17,7 @@ PHYSICS_STEP = 0.002
 ARENA = 400.0  # m, half the side of the ground plane
 _FOOT_RADIUS_PER_ARM = 0.08
 _LEG_PER_ARM = 0.45
+_FRAME_PER_ARM = 0.35
 
 
 def check_vehicle(vehicle: Vehicle) -> None:
@@ -50,6 +51,14 @@ def leg_length(vehicle: Vehicle) -> float:
     return max(_LEG_PER_ARM * arm, -lowest + 2 * _FOOT_RADIUS_PER_ARM * arm)
 
 
+def reach(vehicle: Vehicle) -> float:
+    """Distance from the centre of mass to the farthest part that can touch the ground, m."""
+    arm = max(math.hypot(x, y) for x, y, _ in vehicle.rotor_positions)
+    foot = _FOOT_RADIUS_PER_ARM * arm
+    frame = _FRAME_PER_ARM * arm
+    return max(math.hypot(arm, leg_length(vehicle) - foot) + foot, math.sqrt(2.0 * frame**2 + (0.1 * arm) ** 2))
+
+
 def model_xml(vehicle: Vehicle) -> str:
     """The MJCF of a vehicle: one free body with its believed mass and inertia, four feet, and a ground
     plane.
@@ -61,7 +70,7 @@ def model_xml(vehicle: Vehicle) -> str:
         f'      <geom name="foot{i}" type="sphere" size="{foot:.6g}" pos="{x:.6g} {y:.6g} {foot - leg:.6g}"/>'
         for i, (x, y, _) in enumerate(vehicle.rotor_positions)
     )
-    half = 0.35 * arm
+    half = _FRAME_PER_ARM * arm
     inertia = " ".join(f"{moment:.9g}" for moment in vehicle.inertia)
     # A contact's damping must not push a light vehicle off the ground: one step's time constant is too stiff,
     # ten steps (20 ms) keep the legs' spring well below the physics rate.

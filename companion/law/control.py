@@ -234,6 +234,11 @@ class ControlLaw:
             or not self._thrust_low < attitude.thrust < self._thrust_high
         )
 
+    @property
+    def thrust_limits(self) -> tuple[float, float]:
+        """The least and the greatest thrust that is asked for, N."""
+        return self._thrust_low, self._thrust_high
+
     def normalised(self, thrust: float) -> float:
         """Normalised collective command (0 to 1) believed to give `thrust` in N."""
         return min(1.0, max(0.0, self.vehicle.command(thrust)))

@@ -44,8 +44,8 @@ Preview = Callable[[float], ReferenceSample]
 
 _AHEAD = 0.02
 """s over which the correction's rate of change is taken, where no lag asks for more."""
-_LONGEST_STEP = 0.1  # s of integration and fading in one tick, so that a gap in the odometry gives no jump
-_INTEGRAL_AUTHORITY = 3.0  # m/s², the most that the integral of `lqr_integral` may ask for per axis
+LONGEST_STEP = 0.1  # s of integration and fading in one tick, so that a gap in the odometry gives no jump
+INTEGRAL_AUTHORITY = 3.0  # m/s², the most that the integral of `lqr_integral` may ask for per axis
 
 
 class Corrector(Protocol):
@@ -154,7 +154,7 @@ class LqrIntegral:
         self._integral = ZERO  # m s, world
         mass = law.vehicle.mass
         per_axis = (GRAVITY * abs(gains.K_i[1][0]), GRAVITY * abs(gains.K_i[0][1]), gains.K_i[2][2] / mass)
-        self._most = [_INTEGRAL_AUTHORITY / k if k > 0.0 else 0.0 for k in per_axis]
+        self._most = [INTEGRAL_AUTHORITY / k if k > 0.0 else 0.0 for k in per_axis]
 
     def start(self) -> None:
         """Keep the integral: what it has learned in the climb still holds."""
@@ -168,7 +168,7 @@ class LqrIntegral:
         reference = preview(0.0)
         zeta = euler(state.quaternion)
         c, s = math.cos(zeta[2]), math.sin(zeta[2])
-        dt = min(_LONGEST_STEP, max(0.0, dt))
+        dt = min(LONGEST_STEP, max(0.0, dt))
         grown = tuple(
             min(most, max(-most, i + dt * (p - r)))
             for i, p, r, most in zip(
@@ -298,7 +298,7 @@ class Corrected:
 
     def _faded(self, engaged: float, dt: float) -> float:
         """The share of look-ahead and trim: follows what is engaged, at the pace of a fade at most."""
-        change = min(_LONGEST_STEP, max(0.0, dt))
+        change = min(LONGEST_STEP, max(0.0, dt))
         self._share = min(self._share + change, max(self._share - change, engaged))
         return self._share
 
@@ -313,7 +313,7 @@ class Corrected:
         elif self._behaviour is not None:
             self._behaviour.step(reference, dt)
             if not self._at_limit:  # what is missing there is not the correction
-                self._grow(state.position, self._behaviour.position, zeta[2], share * min(_LONGEST_STEP, dt))
+                self._grow(state.position, self._behaviour.position, zeta[2], share * min(LONGEST_STEP, dt))
         c, s = math.cos(zeta[2]), math.sin(zeta[2])
         x, y, z = (share * t for t in self._trim)
         return c * x + s * y, c * y - s * x, z

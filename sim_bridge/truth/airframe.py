@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import sqrt
+from typing import Any
 
 from trueflight.models.vehicle import Vehicle
 from trueflight.sim_bridge.truth.battery import Battery, BatteryCell, battery_for
@@ -20,9 +21,9 @@ AIR_DENSITY = 1.225
 
 _THRUST_COEFFICIENT = 0.1  # of a small fixed-pitch propeller: thrust = C_T rho n² D⁴
 _DRAG_TORQUE_PER_DIAMETER = 0.07  # drag torque over thrust and diameter, likewise typical
-_MOTOR_EFFICIENCY = 0.75
-_AVIONICS_POWER = 3.0  # W
-_DISCHARGE_STEPS = 5  # the state of charge moves in minutes; it need not be integrated at the physics rate
+MOTOR_EFFICIENCY = 0.75
+AVIONICS_POWER = 3.0  # W
+DISCHARGE_STEPS = 5  # the state of charge moves in minutes; it need not be integrated at the physics rate
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def believed_powertrain(vehicle: Vehicle) -> Powertrain:
     turns = math.sqrt(share / (_THRUST_COEFFICIENT * AIR_DENSITY * diameter**4))
     speed = 2 * math.pi * turns
     torque_per_thrust = _DRAG_TORQUE_PER_DIAMETER * diameter
-    power = 4 * torque_per_thrust * share * speed / _MOTOR_EFFICIENCY + _AVIONICS_POWER
+    power = 4 * torque_per_thrust * share * speed / MOTOR_EFFICIENCY + AVIONICS_POWER
     constant = share / speed**2
     return Powertrain(
         thrust_constants=(constant, constant, constant, constant),
@@ -96,13 +97,26 @@ class Motion:
 
 
 Act = Callable[[Motion], None]
+Law = Callable[..., Act]
+"""A formula, given its numbers; these may be floats, or arrays with one number for each of many vehicles, and so may
+those of `Motion` then."""
+
+
+@dataclass(frozen=True)
+class Acting:
+    """A formula that acts, with its numbers (floats, or tuples of them), so that many vehicles with the same one can be
+    flown together; `many` is its form for arrays."""
+
+    many: Law
+    numbers: tuple[Any, ...]
 
 
 class Airframe:
     """The vehicle's rotors in air.
 
     `on_rotors` are called after the rotors' speeds are known and may change `motion.thrusts`; `on_body` are
-    called last and add to `motion.wrench`. `wind` is the air's velocity in the world, m/s.
+    called last and add to `motion.wrench`; `rotor_laws` and `body_laws` tell what they are made of. `wind` is the air's
+    velocity in the world, m/s.
     """
 
     def __init__(self, vehicle: Vehicle, powertrain: Powertrain, dt: float) -> None:
@@ -111,10 +125,12 @@ class Airframe:
         self.dt = dt
         self.motion = Motion()
         self.battery = Battery(powertrain.battery)
-        self.motion.voltage = self.battery.load(_AVIONICS_POWER)
+        self.motion.voltage = self.battery.load(AVIONICS_POWER)
         self.wind = (0.0, 0.0, 0.0)
         self.on_rotors: list[Act] = []
         self.on_body: list[Act] = []
+        self.rotor_laws: list[Acting] = []
+        self.body_laws: list[Acting] = []
         self._arms = tuple(
             (x, y, direction * powertrain.torque_per_thrust)
             for (x, y, _), direction in zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True)
@@ -122,18 +138,28 @@ class Airframe:
         # Exact solution of the first-order lag over one step; a vehicle file may believe in no lag at all.
         tau = powertrain.time_constant
         self._follow = 1.0 - math.exp(-dt / tau) if tau > 0 else 1.0
-        self._power_per_speed = powertrain.torque_per_thrust / _MOTOR_EFFICIENCY
+        self._power_per_speed = powertrain.torque_per_thrust / MOTOR_EFFICIENCY
         self._steps = 0
         self.keep()
 
+    def act_on_rotors(self, law: Law, *numbers: Any, many: Law | None = None) -> None:
+        """Let a formula act on the rotors' thrusts; `many` where it has another form for arrays."""
+        self.on_rotors.append(law(*numbers))
+        self.rotor_laws.append(Acting(many or law, numbers))
+
+    def act_on_body(self, law: Law, *numbers: Any) -> None:
+        """Let a formula act on the body's force and torque."""
+        self.on_body.append(law(*numbers))
+        self.body_laws.append(Acting(law, numbers))
+
     def keep(self) -> None:
         """Remember what acts now as what acts at every take-off."""
-        self._at_takeoff = self.powertrain, self.wind, tuple(self.on_rotors), tuple(self.on_body)
+        self._at_takeoff = self.powertrain, self.wind, len(self.on_rotors), len(self.on_body)
 
     def restore(self) -> None:
         """Undo what began in flight."""
-        self.powertrain, self.wind, on_rotors, on_body = self._at_takeoff
-        self.on_rotors, self.on_body = list(on_rotors), list(on_body)
+        self.powertrain, self.wind, rotors, body = self._at_takeoff
+        del self.on_rotors[rotors:], self.rotor_laws[rotors:], self.on_body[body:], self.body_laws[body:]
 
     def speed_of(self, command: float) -> float:
         """Rotor speed, rad/s, that a motor command (normalised) settles at."""
@@ -148,7 +174,7 @@ class Airframe:
         """Set all rotors to a speed (rad/s), and the battery under that load, to start a simulation in the air."""
         self.motion.speeds[:] = (speed,) * 4
         power = sum(self.powertrain.thrust_constants) * speed**3 * self._power_per_speed
-        self.motion.voltage = self.battery.load(power + _AVIONICS_POWER)
+        self.motion.voltage = self.battery.load(power + AVIONICS_POWER)
 
     def act(
         self, position: list[float], velocity: list[float], commands: list[float], wrench: memoryview[float]
@@ -218,7 +244,7 @@ class Airframe:
             middle = before + 0.5 * change
             thrusts[i] = thrust = constants[i] * middle * middle
             power += thrust * middle
-        self.motion.voltage = self.battery.load(power * self._power_per_speed + _AVIONICS_POWER)
+        self.motion.voltage = self.battery.load(power * self._power_per_speed + AVIONICS_POWER)
         self._steps += 1
-        if self._steps % _DISCHARGE_STEPS == 0:
-            self.battery.discharge(_DISCHARGE_STEPS * self.dt)
+        if self._steps % DISCHARGE_STEPS == 0:
+            self.battery.discharge(DISCHARGE_STEPS * self.dt)

@@ -9,8 +9,8 @@ from trueflight.models.vehicle import Vehicle
 
 # Rest voltage of one lithium-polymer cell over its state of charge, a typical curve (Plett, "Battery
 # Management Systems I", 2015, section 2.2, shows the shape).
-_CHARGE = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-_CELL = (3.20, 3.52, 3.63, 3.71, 3.75, 3.79, 3.84, 3.90, 3.97, 4.05, 4.13, 4.20)
+CELL_CHARGE = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+CELL = (3.20, 3.52, 3.63, 3.71, 3.75, 3.79, 3.84, 3.90, 3.97, 4.05, 4.13, 4.20)
 _CELL_NOMINAL = 4.0
 """A vehicle's nominal_voltage is taken as 4.0 V a cell: a well charged battery under the load of a hover."""
 
@@ -88,9 +88,9 @@ class Battery:
     def open_circuit_voltage(self) -> float:
         """Voltage at rest, V, at the present state of charge."""
         charge = min(max(self.charge, 0.0), 1.0)
-        i = min(bisect_right(_CHARGE, charge), len(_CHARGE) - 1)
-        share = (charge - _CHARGE[i - 1]) / (_CHARGE[i] - _CHARGE[i - 1])
-        return self.cell.volts_per_cell_volt * (_CELL[i - 1] + share * (_CELL[i] - _CELL[i - 1]))
+        i = min(bisect_right(CELL_CHARGE, charge), len(CELL_CHARGE) - 1)
+        share = (charge - CELL_CHARGE[i - 1]) / (CELL_CHARGE[i] - CELL_CHARGE[i - 1])
+        return self.cell.volts_per_cell_volt * (CELL[i - 1] + share * (CELL[i] - CELL[i - 1]))
 
     def load(self, power: float) -> float:
         """Terminal voltage, V, when the consumers draw `power` W now."""

@@ -52,14 +52,17 @@ class Noise:
 
 NO_NOISE = Noise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
-_BLOCK, _DRAWS = 1024, 25
+BLOCK, DRAWS = 1024, 25
+"""Samples drawn at a time, and numbers for each: nine of the wander, then position, velocity, attitude, gyroscope,
+accelerometer and voltage."""
 
 
 class Sensors:
     """Draws every sample's errors from one seeded generator.
 
     `accelerometer_bias` (m/s², body), `lever_arm` (m, of the accelerometer from the centre of mass, body) and `delay`
-    (s, from a moment to its sample's arrival at a companion) are hidden effects.
+    (s, from a moment to its sample's arrival at a companion) are hidden effects. `wander` are the slow errors now, in
+    standard deviations: position, velocity, attitude.
     """
 
     def __init__(self, noise: Noise, seed: int) -> None:
@@ -69,8 +72,13 @@ class Sensors:
         self.delay = 0.0
         self._generator = np.random.default_rng([seed, 0x5E45])
         self._rows: list[list[float]] = []
-        self._wander = [float(x) for x in self._generator.standard_normal(9)]
+        self.wander = [float(x) for x in self._generator.standard_normal(9)]
         self._last_us = 0
+
+    def draw_block(self) -> np.ndarray:
+        """The next standard normal draws, a row a sample; the last row is used first."""
+        # In blocks: one call for a thousand samples costs less than one call for each number.
+        return self._generator.standard_normal((BLOCK, DRAWS))
 
     def sample(
         self,
@@ -89,10 +97,9 @@ class Sensors:
         to the step that has just been made, so that the specific force is the one that acted in it.
         """
         if not self._rows:
-            # Drawn in blocks: one call for a thousand samples costs less than one call for each number.
-            self._rows = self._generator.standard_normal((_BLOCK, _DRAWS)).tolist()
+            self._rows = self.draw_block().tolist()
         n = self._rows.pop()
-        noise, wander = self.noise, self._wander
+        noise, wander = self.noise, self.wander
         # The autopilot's own sample may be newer than the one that a companion is told next.
         if time_us > self._last_us:
             self._let_wander(time_us, n)
@@ -134,7 +141,7 @@ class Sensors:
         """Move the slow errors on from the last time to this one."""
         decay = math.exp((time_us - self._last_us) * -1e-6 / self.noise.wander_time)
         kick = math.sqrt(1.0 - decay * decay)
-        self._wander[:] = [decay * old + kick * new for old, new in zip(self._wander, n, strict=False)]
+        self.wander[:] = [decay * old + kick * new for old, new in zip(self.wander, n, strict=False)]
         self._last_us = time_us
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from trueflight.sim_bridge.truth.airframe import Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -23,14 +23,19 @@ class BatterySag(TruthEffect):
     ) -> None:
         """All thrusts times (V / V_nominal) to the exponent."""
         nominal, exponent = airframe.vehicle.nominal_voltage, numbers["exponent"]
+        airframe.act_on_rotors(by_voltage, nominal, exponent)
 
-        def act(m: Motion) -> None:
-            factor = (m.voltage / nominal) ** exponent
-            thrusts = m.thrusts
-            for i in (0, 1, 2, 3):
-                thrusts[i] *= factor
 
-        airframe.on_rotors.append(act)
+def by_voltage(nominal: Any, exponent: Any) -> Act:
+    """Thrusts times (V / nominal) to the exponent."""
+
+    def act(m: Motion) -> None:
+        factor = (m.voltage / nominal) ** exponent
+        thrusts = m.thrusts
+        for i in (0, 1, 2, 3):
+            thrusts[i] *= factor
+
+    return act
 
 
 EFFECT = BatterySag()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import random
-from typing import ClassVar
+from typing import Any, ClassVar
+
+import numpy as np
 
 from trueflight.models.vehicle import Vehicle
-from trueflight.sim_bridge.truth.airframe import Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -36,16 +38,32 @@ class CeilingEffect(TruthEffect):
         hubs = tuple(airframe.vehicle.rotor_positions)
         square = (numbers["radius_factor"] * airframe.vehicle.rotor_radius) ** 2 / 6.924
         height = numbers["height"]
+        airframe.act_on_rotors(below_ceiling, square, height, hubs, many=many_below_ceiling)
 
-        def act(m: Motion) -> None:
-            z, r20, r21, r22 = m.z, m.r20, m.r21, m.r22
-            thrusts = m.thrusts
-            for i, (x, y, up) in enumerate(hubs):
-                distance = height - (z + r20 * x + r21 * y + r22 * up)
-                near = square / (max(distance, 0.0) + 0.0378) ** 2
-                thrusts[i] /= 1.0 - (near if near < 0.5 else 0.5)
 
-        airframe.on_rotors.append(act)
+def below_ceiling(square: float, height: float, hubs: Any) -> Act:
+    """Thrusts over 1 - square / (distance + 0.0378 m)², square in m²."""
+
+    def act(m: Motion) -> None:
+        z, r20, r21, r22 = m.z, m.r20, m.r21, m.r22
+        thrusts = m.thrusts
+        for i, (x, y, up) in enumerate(hubs):
+            distance = height - (z + r20 * x + r21 * y + r22 * up)
+            near = square / (max(distance, 0.0) + 0.0378) ** 2
+            thrusts[i] /= 1.0 - (near if near < 0.5 else 0.5)
+
+    return act
+
+
+def many_below_ceiling(square: Any, height: Any, hubs: Any) -> Act:
+    """The same for many vehicles."""
+
+    def act(m: Motion) -> None:
+        for i, (x, y, up) in enumerate(hubs):
+            distance = height - (m.z + m.r20 * x + m.r21 * y + m.r22 * up)
+            m.thrusts[i] /= 1.0 - np.minimum(square / (np.maximum(distance, 0.0) + 0.0378) ** 2, 0.5)
+
+    return act
 
 
 EFFECT = CeilingEffect()

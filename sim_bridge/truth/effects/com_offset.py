@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import random
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from trueflight.models.vehicle import Vehicle
-from trueflight.sim_bridge.truth.airframe import Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
 from trueflight.sim_bridge.truth.effect import TruthEffect, times_larger
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -34,15 +34,19 @@ class CentreOfMassOffset(TruthEffect):
         self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
     ) -> None:
         """Every rotor's arm is shorter by the offset."""
-        cx, cy = numbers["x"], numbers["y"]
+        airframe.act_on_body(off_centre, numbers["x"], numbers["y"])
 
-        def act(m: Motion) -> None:
-            body = m.wrench
-            for thrust in m.thrusts:
-                body[3] += -cy * thrust
-                body[4] -= -cx * thrust
 
-        airframe.on_body.append(act)
+def off_centre(cx: Any, cy: Any) -> Act:
+    """Torque (N m) of all thrusts on the arm -x, -y (m)."""
+
+    def act(m: Motion) -> None:
+        body = m.wrench
+        for thrust in m.thrusts:
+            body[3] += -cy * thrust
+            body[4] -= -cx * thrust
+
+    return act
 
 
 EFFECT = CentreOfMassOffset()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from math import sqrt
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from trueflight.sim_bridge.truth.airframe import Airframe, Motion
+import numpy as np
+
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -44,29 +46,55 @@ class GroundEffect(TruthEffect):
             for i in range(4)
             for j in range(i)
         )
+        airframe.act_on_rotors(images, half_square, least, ceiling, hubs, pairs, many=many_images)
 
-        def act(m: Motion) -> None:
-            z, r20, r21, r22 = m.z, m.r20, m.r21, m.r22
-            if z > ceiling:
-                return
-            heights = [0.0, 0.0, 0.0, 0.0]
-            images = [0.0, 0.0, 0.0, 0.0]
-            for i, (x, y, up) in enumerate(hubs):
-                h = z + r20 * x + r21 * y + r22 * up
-                heights[i] = h = h if h > least else least
-                images[i] = 0.125 / (h * h)
-            for i, j, apart in pairs:
-                h = 0.5 * (heights[i] + heights[j])
-                square = apart + 4.0 * h * h
-                image = h / (square * sqrt(square))
-                images[i] += image
-                images[j] += image
-            thrusts = m.thrusts
-            for i in (0, 1, 2, 3):
-                loss = half_square * images[i]
-                thrusts[i] /= 1.0 - (loss if loss < 0.5 else 0.5)
 
-        airframe.on_rotors.append(act)
+def images(half_square: float, least: float, ceiling: float, hubs: Any, pairs: Any) -> Act:
+    """Thrusts over 1 - loss, by the images of all hubs (m); heights are `least` at least, none above `ceiling`."""
+
+    def act(m: Motion) -> None:
+        z, r20, r21, r22 = m.z, m.r20, m.r21, m.r22
+        if z > ceiling:
+            return
+        heights = [0.0, 0.0, 0.0, 0.0]
+        sums = [0.0, 0.0, 0.0, 0.0]
+        for i, (x, y, up) in enumerate(hubs):
+            h = z + r20 * x + r21 * y + r22 * up
+            heights[i] = h = h if h > least else least
+            sums[i] = 0.125 / (h * h)
+        for i, j, apart in pairs:
+            h = 0.5 * (heights[i] + heights[j])
+            square = apart + 4.0 * h * h
+            image = h / (square * sqrt(square))
+            sums[i] += image
+            sums[j] += image
+        thrusts = m.thrusts
+        for i in (0, 1, 2, 3):
+            loss = half_square * sums[i]
+            thrusts[i] /= 1.0 - (loss if loss < 0.5 else 0.5)
+
+    return act
+
+
+def many_images(half_square: Any, least: Any, ceiling: Any, hubs: Any, pairs: Any) -> Act:
+    """The same for many vehicles."""
+
+    def act(m: Motion) -> None:
+        near = m.z <= ceiling
+        if not np.any(near):
+            return
+        heights = [np.maximum(m.z + m.r20 * x + m.r21 * y + m.r22 * up, least) for x, y, up in hubs]
+        sums = [0.125 / (h * h) for h in heights]
+        for i, j, apart in pairs:
+            h = 0.5 * (heights[i] + heights[j])
+            square = apart + 4.0 * h * h
+            image = h / (square * np.sqrt(square))
+            sums[i] = sums[i] + image
+            sums[j] = sums[j] + image
+        for i, total in enumerate(sums):
+            m.thrusts[i] /= 1.0 - near * np.minimum(half_square * total, 0.5)
+
+    return act
 
 
 EFFECT = GroundEffect()

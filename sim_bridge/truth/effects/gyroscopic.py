@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from trueflight.models.vehicle import Vehicle
-from trueflight.sim_bridge.truth.airframe import Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
 from trueflight.sim_bridge.truth.effect import USUAL_MASS, TruthEffect, times_larger
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -31,19 +31,23 @@ class Gyroscopic(TruthEffect):
     ) -> None:
         """Minus the change of momentum as seen from the body."""
         inertia, directions = numbers["inertia"], tuple(airframe.vehicle.rotor_directions)
-        rate = 1.0 / airframe.dt
-        before: list[float] = []
+        airframe.act_on_body(momentum_of_rotors, inertia, directions, 1.0 / airframe.dt)
 
-        def act(m: Motion) -> None:
-            momentum = inertia * sum(s * w for s, w in zip(directions, m.speeds, strict=True))
-            spin_up = (momentum - before[0]) * rate if before else 0.0
-            before[:] = [momentum]
-            body = m.wrench
-            body[3] -= m.q * momentum
-            body[4] += m.p * momentum
-            body[5] -= spin_up
 
-        airframe.on_body.append(act)
+def momentum_of_rotors(inertia: Any, directions: Any, rate: float) -> Act:
+    """Minus the change of momentum as seen from the body; `rate` is 1 / step, 1/s."""
+    before: list[Any] = []
+
+    def act(m: Motion) -> None:
+        momentum = inertia * sum(s * w for s, w in zip(directions, m.speeds, strict=True))
+        spin_up = (momentum - before[0]) * rate if before else 0.0
+        before[:] = [momentum]
+        body = m.wrench
+        body[3] -= m.q * momentum
+        body[4] += m.p * momentum
+        body[5] -= spin_up
+
+    return act
 
 
 EFFECT = Gyroscopic()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import random
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from trueflight.models.vehicle import Vehicle
-from trueflight.sim_bridge.truth.airframe import AIR_DENSITY, Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import AIR_DENSITY, Act, Airframe, Motion
 from trueflight.sim_bridge.truth.effect import TruthEffect, times_larger
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -41,16 +41,21 @@ class ParasiticDrag(TruthEffect):
         """Force -0.5 rho (C_D A)_axis |V| V_axis at the centre of mass."""
         areas = [2.0 * airframe.vehicle.mass * numbers[axis] / AIR_DENSITY for axis in "xyz"]
         ax, ay, az = (0.5 * AIR_DENSITY * area for area in areas)
+        airframe.act_on_body(with_square_of_speed, ax, ay, az)
 
-        def act(m: Motion) -> None:
-            u, v, w = m.u, m.v, m.w
-            speed = (u * u + v * v + w * w) ** 0.5
-            body = m.wrench
-            body[0] -= ax * speed * u
-            body[1] -= ay * speed * v
-            body[2] -= az * speed * w
 
-        airframe.on_body.append(act)
+def with_square_of_speed(ax: Any, ay: Any, az: Any) -> Act:
+    """Force -a |V| V for each axis, a in N s²/m²."""
+
+    def act(m: Motion) -> None:
+        u, v, w = m.u, m.v, m.w
+        speed = (u * u + v * v + w * w) ** 0.5
+        body = m.wrench
+        body[0] -= ax * speed * u
+        body[1] -= ay * speed * v
+        body[2] -= az * speed * w
+
+    return act
 
 
 EFFECT = ParasiticDrag()

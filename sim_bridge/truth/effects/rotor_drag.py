@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from trueflight.models.vehicle import Vehicle
 from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
@@ -37,14 +37,18 @@ class RotorDrag(TruthEffect):
         self, airframe: Airframe, sensors: Sensors, numbers: dict[str, float], others: frozenset[str]
     ) -> None:
         """Force -c omega_i V_i at every hub, V_i with the velocity that the body's rates give the hub."""
-        airframe.on_body.append(rotor_drag(airframe, numbers["x"], numbers["y"]))
+        attach_rotor_drag(airframe, numbers["x"], numbers["y"])
 
 
-def rotor_drag(airframe: Airframe, x_per_s: float, y_per_s: float) -> Act:
-    """The H-force of four rotors, given as acceleration per speed (1/s) when all turn at hover speed."""
+def attach_rotor_drag(airframe: Airframe, x_per_s: float, y_per_s: float) -> None:
+    """Let the H-force of four rotors act, given as acceleration per speed (1/s) when all turn at hover speed."""
     per_rotor = airframe.vehicle.mass / (4 * airframe.powertrain.hover_speed)
-    cx, cy = x_per_s * per_rotor, y_per_s * per_rotor
     hubs = tuple(airframe.vehicle.rotor_positions)
+    airframe.act_on_body(h_force, x_per_s * per_rotor, y_per_s * per_rotor, hubs)
+
+
+def h_force(cx: Any, cy: Any, hubs: Any) -> Act:
+    """The H-force of all rotors: -c times rotor speed times the air's velocity at the hub (m), c in N s²/m/rad."""
 
     def act(m: Motion) -> None:
         u, v, p, q, r = m.u, m.v, m.p, m.q, m.r

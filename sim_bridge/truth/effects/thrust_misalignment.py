@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import random
 from math import sqrt
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from trueflight.models.vehicle import Vehicle
-from trueflight.sim_bridge.truth.airframe import Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -34,19 +34,24 @@ class ThrustMisalignment(TruthEffect):
         sx, sy = math.sin(numbers["x"]), math.sin(numbers["y"])
         short = 1.0 - sqrt(1.0 - sx * sx - sy * sy)
         hubs = tuple(airframe.vehicle.rotor_positions)
+        airframe.act_on_body(leaning, sx, sy, short, hubs)
 
-        def act(m: Motion) -> None:
-            body = m.wrench
-            for thrust, (x, y, z) in zip(m.thrusts, hubs, strict=True):
-                fx, fy, fz = sx * thrust, sy * thrust, -short * thrust
-                body[0] += fx
-                body[1] += fy
-                body[2] += fz
-                body[3] += y * fz - z * fy
-                body[4] += z * fx - x * fz
-                body[5] += x * fy - y * fx
 
-        airframe.on_body.append(act)
+def leaning(sx: Any, sy: Any, short: Any, hubs: Any) -> Act:
+    """Force and torque of each thrust along (sx, sy, 1 - short) instead of (0, 0, 1)."""
+
+    def act(m: Motion) -> None:
+        body = m.wrench
+        for thrust, (x, y, z) in zip(m.thrusts, hubs, strict=True):
+            fx, fy, fz = sx * thrust, sy * thrust, -short * thrust
+            body[0] += fx
+            body[1] += fy
+            body[2] += fz
+            body[3] += y * fz - z * fy
+            body[4] += z * fx - x * fz
+            body[5] += x * fy - y * fx
+
+    return act
 
 
 EFFECT = ThrustMisalignment()

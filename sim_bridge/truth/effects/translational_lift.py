@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from trueflight.sim_bridge.truth.airframe import Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -28,15 +28,20 @@ class TranslationalLift(TruthEffect):
         """A quarter of the gain at every hub, with the velocity that the body's rates give the hub."""
         gain = 0.25 * airframe.vehicle.mass * numbers["lift"]
         hubs = tuple(airframe.vehicle.rotor_positions)
+        airframe.act_on_rotors(with_edgewise_flow, gain, hubs)
 
-        def act(m: Motion) -> None:
-            u, v, p, q, r = m.u, m.v, m.p, m.q, m.r
-            thrusts = m.thrusts
-            for i, (x, y, z) in enumerate(hubs):
-                hx, hy = u + q * z - r * y, v + r * x - p * z
-                thrusts[i] += gain * (hx * hx + hy * hy)
 
-        airframe.on_rotors.append(act)
+def with_edgewise_flow(gain: Any, hubs: Any) -> Act:
+    """Thrusts plus gain (N s²/m²) times the square of the airspeed in the plane at each hub (m)."""
+
+    def act(m: Motion) -> None:
+        u, v, p, q, r = m.u, m.v, m.p, m.q, m.r
+        thrusts = m.thrusts
+        for i, (x, y, z) in enumerate(hubs):
+            hx, hy = u + q * z - r * y, v + r * x - p * z
+            thrusts[i] += gain * (hx * hx + hy * hy)
+
+    return act
 
 
 EFFECT = TranslationalLift()

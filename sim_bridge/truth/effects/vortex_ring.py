@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from math import sqrt
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from trueflight.sim_bridge.truth.airframe import AIR_DENSITY, Airframe, Motion
+import numpy as np
+
+from trueflight.sim_bridge.truth.airframe import AIR_DENSITY, Act, Airframe, Motion
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -31,20 +33,40 @@ class VortexRing(TruthEffect):
         disc = math.pi * vehicle.rotor_radius**2
         induced = math.sqrt(0.25 * vehicle.weight / (2.0 * AIR_DENSITY * disc))
         hubs, loss = tuple(vehicle.rotor_positions), numbers["loss"]
+        airframe.act_on_rotors(in_own_wake, loss, induced, hubs, many=many_in_own_wake)
 
-        def act(m: Motion) -> None:
-            u, v, w, p, q = m.u, m.v, m.w, m.p, m.q
-            edgewise = sqrt(u * u + v * v) / induced
-            if edgewise >= 1.0:
-                return
-            thrusts = m.thrusts
-            for i, (x, y, _) in enumerate(hubs):
-                sinking = -(w + p * y - q * x) / induced
-                if 0.3 < sinking < 1.5:
-                    ring = 0.5 - 0.5 * math.cos(2.0 * math.pi * (sinking - 0.3) / 1.2)
-                    thrusts[i] *= 1.0 - loss * ring * (1.0 - edgewise)
 
-        airframe.on_rotors.append(act)
+def in_own_wake(loss: float, induced: float, hubs: Any) -> Act:
+    """Thrusts times one minus the loss; `induced` in m/s."""
+
+    def act(m: Motion) -> None:
+        u, v, w, p, q = m.u, m.v, m.w, m.p, m.q
+        edgewise = sqrt(u * u + v * v) / induced
+        if edgewise >= 1.0:
+            return
+        thrusts = m.thrusts
+        for i, (x, y, _) in enumerate(hubs):
+            sinking = -(w + p * y - q * x) / induced
+            if 0.3 < sinking < 1.5:
+                ring = 0.5 - 0.5 * math.cos(2.0 * math.pi * (sinking - 0.3) / 1.2)
+                thrusts[i] *= 1.0 - loss * ring * (1.0 - edgewise)
+
+    return act
+
+
+def many_in_own_wake(loss: Any, induced: Any, hubs: Any) -> Act:
+    """The same for many vehicles."""
+
+    def act(m: Motion) -> None:
+        flat = loss * np.maximum(1.0 - np.sqrt(m.u * m.u + m.v * m.v) / induced, 0.0)
+        if not np.any(flat):
+            return
+        for i, (x, y, _) in enumerate(hubs):
+            sinking = -(m.w + m.p * y - m.q * x) / induced
+            ring = 0.5 - 0.5 * np.cos(2.0 * math.pi * (np.clip(sinking, 0.3, 1.5) - 0.3) / 1.2)
+            m.thrusts[i] *= 1.0 - flat * ring
+
+    return act
 
 
 EFFECT = VortexRing()

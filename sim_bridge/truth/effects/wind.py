@@ -9,7 +9,7 @@ from typing import ClassVar
 from trueflight.models.vehicle import Vehicle
 from trueflight.sim_bridge.truth.airframe import Airframe
 from trueflight.sim_bridge.truth.effect import TruthEffect
-from trueflight.sim_bridge.truth.effects.rotor_drag import rotor_drag
+from trueflight.sim_bridge.truth.effects.rotor_drag import attach_rotor_drag
 from trueflight.sim_bridge.truth.sensors import Sensors
 
 
@@ -38,7 +38,7 @@ class Wind(TruthEffect):
         """Move the air; bring rotor drag along if nothing else drags."""
         airframe.wind = (numbers["east"], numbers["north"], 0.0)
         if not others & {"rotor_drag", "parasitic_drag"}:
-            airframe.on_body.append(rotor_drag(airframe, numbers["drag"], numbers["drag"]))
+            attach_rotor_drag(airframe, numbers["drag"], numbers["drag"])
 
 
 EFFECT = Wind()
