@@ -17,7 +17,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -92,24 +92,8 @@ class FlightRecorder:
         self, vehicle: Vehicle, design: Design | None, metadata: dict[str, str], now: int, simulated: bool
     ) -> None:
         """What stands before the first tick; forced to the disk, so that a full one is seen before the flight."""
-        self._writer = Writer(self._disk, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile="trueflight", library="trueflight")
-        schemas = FileDescriptorSet()
-        DESCRIPTOR.CopyToProto(schemas.file.add())
-        self._channels = []
-        for topic, kind in ((TICK_TOPIC, Tick), (EVENT_TOPIC, Event)):
-            name = kind.DESCRIPTOR.full_name
-            schema = self._writer.register_schema(name, "protobuf", schemas.SerializeToString())
-            self._channels.append(self._writer.register_channel(topic, "protobuf", schema))
         created = {} if simulated else {"created_ns": str(now)}
-        self._writer.add_metadata("flight", {"vehicle": vehicle.name, **created, **metadata})
-        self._writer.add_attachment(
-            now, now, "vehicle.toml", "application/toml", vehicle_to_toml(vehicle).encode()
-        )
-        if design is not None:
-            self._writer.add_attachment(
-                now, now, "design.json", "application/json", design_to_json(design).encode()
-            )
+        self._writer, self._channels = begin_record(self._disk, vehicle, design, {**created, **metadata}, now)
         self._disk.sync()
 
     def tick(self, tick: Tick | bytes, vehicle_time_us: int, host_time_ns: int) -> None:
@@ -182,12 +166,40 @@ class FlightRecorder:
         )
 
     def _finish(self) -> None:
-        counts = {"dropped": self.dropped, "ticks": self._sequence[0], "events": self._sequence[1]}
-        self._writer.add_metadata("end", {key: str(value) for key, value in counts.items()})
-        self._writer.finish()
+        end_record(self._writer, self._sequence[0], self._sequence[1], self.dropped)
         self._disk.still_there()
         self._disk.sync()
         self._disk.give_up()
+
+
+def begin_record(
+    stream: Any, vehicle: Vehicle, design: Design | None, metadata: dict[str, str], now: int
+) -> tuple[Writer, list[int]]:
+    """What stands in a record before the first tick, written to a binary `stream`; `now` in ns since 1970, 0 for a
+    simulated flight. Returns the writer, and its channels of ticks and of events."""
+    writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+    writer.start(profile="trueflight", library="trueflight")
+    schemas = FileDescriptorSet()
+    DESCRIPTOR.CopyToProto(schemas.file.add())
+    channels = []
+    for topic, kind in ((TICK_TOPIC, Tick), (EVENT_TOPIC, Event)):
+        name = kind.DESCRIPTOR.full_name
+        schema = writer.register_schema(name, "protobuf", schemas.SerializeToString())
+        channels.append(writer.register_channel(topic, "protobuf", schema))
+    writer.add_metadata("flight", {"vehicle": vehicle.name, **metadata})
+    attached = [("vehicle.toml", "application/toml", vehicle_to_toml(vehicle))]
+    if design is not None:
+        attached.append(("design.json", "application/json", design_to_json(design)))
+    for name, kind_of_text, text in attached:
+        writer.add_attachment(now, now, name, kind_of_text, text.encode())
+    return writer, channels
+
+
+def end_record(writer: Writer, ticks: int, events: int, dropped: int) -> None:
+    """What stands in a record behind the last tick: how many messages there are, and the index."""
+    counts = {"dropped": dropped, "ticks": ticks, "events": events}
+    writer.add_metadata("end", {key: str(value) for key, value in counts.items()})
+    writer.finish()
 
 
 class _Disk:

@@ -27,7 +27,7 @@ from trueflight.models.trajectory import (
     hold,
     min_jerk,
     path,
-    quintic,
+    quintics,
     transfer,
 )
 
@@ -538,9 +538,8 @@ def trajectory_from_csv(text: str, where: str = "setpoints") -> Trajectory:
     acceleration = _differences(t, velocity)
     if "ax" in column:
         acceleration[:, :3] = np.stack([column["ax"], column["ay"], column["az"]], -1)
-    state = np.stack([position, velocity, acceleration], -1).tolist()
-    segments = [quintic(float(t[i + 1] - t[i]), state[i], state[i + 1]) for i in range(len(t) - 1)]
-    return Trajectory("setpoints", tuple(segments), {"rows": float(len(t))})
+    state = np.stack([position, velocity, acceleration], -1)
+    return Trajectory("setpoints", quintics(np.diff(t), state), {"rows": float(len(t))})
 
 
 def _numbers(rows: list[list[str]], names: list[str], where: str) -> np.ndarray:

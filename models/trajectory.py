@@ -132,8 +132,20 @@ class Curve:
         return (1.0 - s, rate, -change) if backwards else (s, rate, change)
 
     def _phases(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        s, rate, change = np.array([self._phase(float(x)) for x in t]).reshape(-1, 3).T
-        return s, rate, change
+        """As `_phase`, for times (n,)."""
+        cruise = 1.0 / (self.duration - self.ramp)
+        backwards = t > self.duration - self.ramp
+        elapsed = np.where(backwards, self.duration - t, t)
+        cruising = elapsed >= self.ramp
+        x = np.where(cruising, 0.0, elapsed) / (self.ramp or 1.0)
+        s = np.where(
+            cruising, cruise * (elapsed - 0.5 * self.ramp), cruise * self.ramp * x * x * x * (1 - 0.5 * x)
+        )
+        rate = np.where(cruising, cruise, cruise * x * x * (3 - 2 * x))
+        change = cruise * 6 * x * (1 - x) / (self.ramp or 1.0)
+        # A cruise is never told backwards.
+        back = backwards & ~cruising
+        return np.where(back, 1.0 - s, s), rate, np.where(back, -change, change)
 
 
 Segment = Polynomial | Curve
@@ -157,6 +169,18 @@ class SetpointTable(Sequence[Segment]):
             rows = tuple(map(tuple, self.coefficients[index].tolist()))
             last = self._last = (index, Polynomial(float(self.durations[index]), rows))
         return last[1]
+
+    def at_all(self, index: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Value, first and second derivative (3, n, 4) of the polynomials `index` (n,) at their own times `t` (n,)."""
+        c0, c1, c2, c3, c4, c5 = self.coefficients[index].transpose(2, 0, 1)
+        t = t[:, None]
+        return np.array(
+            [
+                c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5)))),
+                c1 + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5))),
+                2 * c2 + t * (6 * c3 + t * (12 * c4 + t * 20 * c5)),
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -201,6 +225,11 @@ class Trajectory:
         inside = np.clip(t, 0.0, self.duration)
         index = np.minimum(np.searchsorted(self._ends, inside, side="right"), len(self.segments) - 1)
         values = np.zeros((3, len(t), 4))
+        if isinstance(self.segments, SetpointTable):
+            begins = np.where(index > 0, np.take(self._ends, index - 1), 0.0)
+            local = np.minimum(inside - begins, self.segments.durations[index])
+            values[:] = self.segments.at_all(index, local)
+            index = index[:0]
         for i in np.unique(index):
             where = index == i
             begin = self._ends[i - 1] if i else 0.0
@@ -312,21 +341,18 @@ def path(
     return segments
 
 
-def quintic(duration: float, begin: Sequence[Sequence[float]], end: Sequence[Sequence[float]]) -> Polynomial:
-    """Quintic Hermite segment of `duration` s; `begin` and `end` hold value, first and second derivative of each of
-    four channels.
-    """
-    rows, d = [], duration
-    for (p0, v0, a0), (p1, v1, a1) in zip(begin, end, strict=True):
-        p, v, a = p1 - p0 - v0 * d - 0.5 * a0 * d * d, v1 - v0 - a0 * d, a1 - a0
-        rows.append(
-            (
-                p0,
-                v0,
-                0.5 * a0,
-                10 * p / d**3 - 4 * v / d**2 + 0.5 * a / d,
-                -15 * p / d**4 + 7 * v / d**3 - a / d**2,
-                6 * p / d**5 - 3 * v / d**4 + 0.5 * a / d**3,
-            )
-        )
-    return Polynomial(d, tuple(rows))
+def quintics(durations: np.ndarray, states: np.ndarray) -> SetpointTable:
+    """Quintic Hermite segments of `durations` (N,) s between `states` (N + 1, 4, 3): value, first and second derivative
+    of each of four channels."""
+    d = durations[:, None]
+    (p0, v0, a0), (p1, v1, a1) = (part.transpose(2, 0, 1) for part in (states[:-1], states[1:]))
+    p, v, a = p1 - p0 - v0 * d - 0.5 * a0 * d * d, v1 - v0 - a0 * d, a1 - a0
+    powers = (
+        p0,
+        v0,
+        0.5 * a0,
+        10 * p / d**3 - 4 * v / d**2 + 0.5 * a / d,
+        -15 * p / d**4 + 7 * v / d**3 - a / d**2,
+        6 * p / d**5 - 3 * v / d**4 + 0.5 * a / d**3,
+    )
+    return SetpointTable(durations, np.stack(powers, axis=-1))

@@ -207,8 +207,7 @@ def record(
 def _write_record(plan: Plan, tick: _TickWriter, flown: Flown, path: Path) -> None:
     """Write the record after the flight: the recorder's thread would share the interpreter with the simulation and
     halve its speed."""
-    parameters = {f"parameter.{key}": str(value) for key, value in plan.trajectory.parameters.items()}
-    metadata = {"created_by": "sim-bridge", "trajectory": plan.trajectory.name, **parameters}
+    metadata = record_metadata(plan)
     # All of the flight has room in the queue, so that nothing is dropped.
     recorder = FlightRecorder(
         path, plan.vehicle, plan.design, metadata, queue_limit=len(tick.messages) + 100, simulated=True
@@ -226,6 +225,29 @@ def _write_record(plan: Plan, tick: _TickWriter, flown: Flown, path: Path) -> No
         raise InputError(recorder.error.replace(str(path), "the flight record"))
 
 
+def record_metadata(plan: Plan) -> dict[str, str]:
+    """What a record tells of its flight; nothing of what is hidden."""
+    parameters = {f"parameter.{key}": str(value) for key, value in plan.trajectory.parameters.items()}
+    return {"created_by": "sim-bridge", "trajectory": plan.trajectory.name, **parameters}
+
+
+def constant_tick(plan: Plan) -> Tick:
+    """What is the same in every tick of a flight."""
+    tick = Tick(
+        controller=plan.controller,
+        trajectory=plan.trajectory.name,
+        flight_mode="OFFBOARD",
+        armed=True,
+        setpoint_sent=True,
+        interval=1.0 / plan.rate,
+    )
+    if plan.model is not None:
+        from trueflight.models.contract import model_hash
+
+        tick.model = model_hash(plan.model)
+    return tick
+
+
 class _TickWriter:
     """Turns samples into the protobuf ticks that the companion writes: `messages` with both clocks (us,
     ns), which are one: simulated time.
@@ -233,20 +255,9 @@ class _TickWriter:
 
     def __init__(self, plan: Plan) -> None:
         self.messages: list[tuple[bytes, int, int]] = []
-        self._interval = 1.0 / plan.rate
         self._rotor_speeds = plan.rotor_speeds
         # What is the same in every tick is set once; each tick then overwrites all the rest.
-        self._tick = Tick(
-            controller=plan.controller,
-            trajectory=plan.trajectory.name,
-            flight_mode="OFFBOARD",
-            armed=True,
-            setpoint_sent=True,
-        )
-        if plan.model is not None:
-            from trueflight.models.contract import model_hash
-
-            self._tick.model = model_hash(plan.model)
+        self._tick = constant_tick(plan)
         self.time_us = 0
 
     def __call__(self, sample: Sample) -> None:
@@ -290,7 +301,6 @@ class _TickWriter:
         tick.guard = sample.guard
         tick.phase = "mission" if sample.mission else "takeoff"
         tick.inference = sample.inference
-        tick.interval = self._interval
         self.messages.append((tick.SerializeToString(), now.time_us, host))
 
 

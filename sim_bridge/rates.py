@@ -68,6 +68,7 @@ class Mixer:
         return [hover * t0**0.5, hover * t1**0.5, hover * t2**0.5, hover * t3**0.5]
 
     def give_way(self, collective: float, roll: float, pitch: float, yaw: float) -> list[float]:
+        """Relative thrusts of the motors where their range does not suffice for all that is asked."""
         low, top = IDLE_SHARE, self.top
         tilt = [b * roll + c * pitch for _, b, c, _ in self.rows]
         turn = [d * yaw for _, _, _, d in self.rows]

@@ -56,7 +56,9 @@ def reach(vehicle: Vehicle) -> float:
     arm = max(math.hypot(x, y) for x, y, _ in vehicle.rotor_positions)
     foot = _FOOT_RADIUS_PER_ARM * arm
     frame = _FRAME_PER_ARM * arm
-    return max(math.hypot(arm, leg_length(vehicle) - foot) + foot, math.sqrt(2.0 * frame**2 + (0.1 * arm) ** 2))
+    return max(
+        math.hypot(arm, leg_length(vehicle) - foot) + foot, math.sqrt(2.0 * frame**2 + (0.1 * arm) ** 2)
+    )
 
 
 def model_xml(vehicle: Vehicle) -> str:

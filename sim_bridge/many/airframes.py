@@ -57,6 +57,7 @@ class Airframes:
         self._steps = 0
         self._products = np.empty((4, 4, count))
         self._turned, self._work4 = np.empty((3, 3, count)), np.empty((4, count))
+        self._pair = np.empty((2, count))
         self.refresh()
 
     def refresh(self) -> None:
@@ -107,20 +108,24 @@ class Airframes:
 
     def _rotate(self, quaternion: np.ndarray, out: np.ndarray) -> None:
         """Rotations (9, N), row by row, of quaternions (4, N)."""
-        products = np.multiply(quaternion[:, None], (quaternion + quaternion)[None], out=self._products)
-        w, x, y, z = products
-        for row, first, second, sign in (
-            (1, x[2], w[3], -1),
-            (2, x[3], w[2], 1),
-            (3, x[2], w[3], 1),
-            (5, y[3], w[1], -1),
-            (6, x[3], w[2], -1),
-            (7, y[3], w[1], 1),
+        w, x, y, _ = quaternion
+        doubled = np.add(quaternion, quaternion, out=self._work4)
+        _, twice_x, twice_y, twice_z = doubled
+        one, other = self._pair
+        for first, second, plus, minus in (
+            ((x, twice_y), (w, twice_z), 3, 1),
+            ((x, twice_z), (w, twice_y), 2, 6),
+            ((y, twice_z), (w, twice_x), 7, 5),
         ):
-            (np.add if sign > 0 else np.subtract)(first, second, out=out[row])
-        for row, first, second in ((0, y[2], z[3]), (4, x[1], z[3]), (8, x[1], y[2])):
-            np.subtract(1.0, first, out=out[row])
-            out[row] -= second
+            np.multiply(*first, out=one)
+            np.multiply(*second, out=other)
+            np.add(one, other, out=out[plus])
+            np.subtract(one, other, out=out[minus])
+        doubled *= quaternion
+        _, xx, yy, zz = doubled
+        for row, first_square, second_square in ((0, yy, zz), (4, xx, zz), (8, xx, yy)):
+            np.subtract(1.0, first_square, out=out[row])
+            out[row] -= second_square
 
     def _turn_rotors(self, commands: np.ndarray) -> None:
         target = commands * self._per_hover
@@ -187,9 +192,7 @@ class Batteries:
         """Let the present currents flow for `dt` s."""
         current = (self._source - self._voltage) / self._resistance
         self._charge = np.maximum(self._charge - current * dt / self._capacity, 0.0)
-        self._polarisation += (
-            (current * self._slow_resistance - self._polarisation) * dt / self._slow_time
-        )
+        self._polarisation += (current * self._slow_resistance - self._polarisation) * dt / self._slow_time
         self._settle()
 
     def _settle(self) -> None:

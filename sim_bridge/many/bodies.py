@@ -27,8 +27,8 @@ class Load:
 class Bodies:
     """Rigid bodies of N vehicles, world ENU, body FLU, SI units.
 
-    `position` (7, N) holds x, y, z and the quaternion w, x, y, z; `velocity` (6, N) the linear velocity in the world and
-    the body rates; `touching` (N,) whether any part of a vehicle touches the ground. A body that may touch it is
+    `position` (7, N) holds x, y, z and the quaternion w, x, y, z; `velocity` (6, N) the linear velocity in the world
+    and the body rates; `touching` (N,) whether any part of a vehicle touches the ground. A body that may touch it is
     stepped by MuJoCo with its contacts; all others by the same step in free flight.
     """
 
@@ -49,7 +49,12 @@ class Bodies:
         self._near = np.array([reach(vehicle) for vehicle in vehicles]) + _MARGIN
         self._worlds: dict[int, World] = {}
         self._payloads: dict[int, tuple[float, float]] = {}
-        self._work3, self._work4 = np.empty((3, count)), np.empty((4, 3, count))
+        self._work3, self._turned, self._square = (
+            np.empty((3, count)),
+            np.empty((4, count)),
+            np.empty((4, count)),
+        )
+        self._part = np.empty(count)
         self._weigh()
 
     def place(self, index: int, position: tuple[float, float, float], yaw: float) -> None:
@@ -106,28 +111,30 @@ class Bodies:
         position[:3] += work
 
         np.multiply(turning, turning, out=work)
-        rate = np.sqrt(work[0] + work[1] + work[2])
-        half = (0.5 * PHYSICS_STEP) * rate
-        # sin(half) / rate, and its limit where nothing turns
-        np.multiply(turning, np.sin(half) / np.maximum(rate, 1e-300), out=work)
-        w, x, y, z = quaternion = position[3:]
-        (wa, wb, wc), (xa, xb, xc), (ya, yb, yc), (za, zb, zc) = np.multiply(
-            quaternion[:, None], work[None], out=self._work4
-        )
-        quaternion *= np.cos(half)
-        w -= xa
-        w -= yb
-        w -= zc
-        x += wa
-        x += yc
-        x -= zb
-        y += wb
-        y += za
-        y -= xc
-        z += wc
-        z += xb
-        z -= ya
-        quaternion /= np.sqrt(w * w + x * x + y * y + z * z)
+        square = work[0] + work[1]
+        square += work[2]
+        square *= 0.25 * PHYSICS_STEP**2  # of half the angle turned
+        share, cosine = _half_turn(square)
+        a, b, c = np.multiply(turning, share, out=work)
+        w, x, y, z = position[3:]
+        # The quaternion times (cosine, a, b, c).
+        turned = self._turned
+        part = self._part
+        for out, scaled, added, taken in (
+            (turned[0], w, (), ((x, a), (y, b), (z, c))),
+            (turned[1], x, ((w, a), (y, c)), ((z, b),)),
+            (turned[2], y, ((w, b), (z, a)), ((x, c),)),
+            (turned[3], z, ((w, c), (x, b)), ((y, a),)),
+        ):
+            np.multiply(scaled, cosine, out=out)
+            for q, by in added:
+                out += np.multiply(q, by, out=part)
+            for q, by in taken:
+                out -= np.multiply(q, by, out=part)
+        np.multiply(turned, turned, out=self._square)
+        norm = np.add.reduce(self._square, axis=0, out=part)
+        np.sqrt(norm, out=norm)
+        np.divide(turned, norm, out=position[3:])
 
     def _touch(self, index: int, position: np.ndarray, velocity: np.ndarray, wrench: np.ndarray) -> None:
         """A step of one vehicle by MuJoCo, from the state before the step."""
@@ -144,3 +151,29 @@ class Bodies:
         self.position[:, index] = data.qpos
         self.velocity[:, index] = data.qvel
         self.touching[index] = world.touching
+
+
+def _half_turn(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """sin(h) / rate and cos(h) of half the angle h = rate PHYSICS_STEP / 2 turned in a step, given h² (N,).
+
+    By their series, whose next term is below a float's last digit up to 50 rad/s.
+    """
+    if square.max() > 0.05**2:
+        half = np.sqrt(square)
+        return (0.5 * PHYSICS_STEP) * np.sinc(half / np.pi), np.cos(half)
+    share = square * (-1.0 / 5040.0)
+    share += 1.0 / 120.0
+    share *= square
+    share -= 1.0 / 6.0
+    share *= square
+    share += 1.0
+    share *= 0.5 * PHYSICS_STEP
+    cosine = square * (1.0 / 40320.0)
+    cosine -= 1.0 / 720.0
+    cosine *= square
+    cosine += 1.0 / 24.0
+    cosine *= square
+    cosine -= 0.5
+    cosine *= square
+    cosine += 1.0
+    return share, cosine

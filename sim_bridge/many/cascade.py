@@ -160,20 +160,23 @@ class Cascades:
                 -sr * rate_y + cr * cp * rate_z,
             ]
         )
-        return np.minimum(np.maximum(turning, -self._rates), self._rates)
+        limited: np.ndarray = np.minimum(np.maximum(turning, -self._rates), self._rates)
+        return limited
 
     def at_limit(self, attitude: np.ndarray) -> np.ndarray:
         """Whether (N,) the limits leave no more of tilt or thrust than this attitude (3, N)."""
         roll, pitch, thrust = attitude
         tilted = np.hypot(roll, pitch) >= 0.999 * self._tilt
-        return tilted | ~((self._thrust_low < thrust) & (thrust < self._thrust_high))
+        reached: np.ndarray = tilted | ~((self._thrust_low < thrust) & (thrust < self._thrust_high))
+        return reached
 
     def normalised(self, thrust: np.ndarray) -> np.ndarray:
         """Normalised collective commands (N,) believed to give thrusts (N,) in N."""
         ratio = thrust / self.weight
         if not self._linear.all():
             ratio = np.where(self._linear, ratio, np.copysign(np.sqrt(np.abs(ratio)), ratio))
-        return np.clip(self._hover * ratio, 0.0, 1.0)
+        command: np.ndarray = np.clip(self._hover * ratio, 0.0, 1.0)
+        return command
 
     def limited(self, attitude: np.ndarray) -> np.ndarray:
         """Roll, pitch and thrust (3, N) within the limits; changes what it is given."""

@@ -68,7 +68,9 @@ class ManyLqrIntegral:
         self._k_i = stacked([one.K_i for one in gains if one is not None])
         k = self._k_i
         per_axis = np.array([GRAVITY * abs(k[1, 0]), GRAVITY * abs(k[0, 1]), k[2, 2] / self._law.mass])
-        self._most = np.where(per_axis > 0.0, INTEGRAL_AUTHORITY / np.where(per_axis > 0.0, per_axis, 1.0), 0.0)
+        self._most = np.where(
+            per_axis > 0.0, INTEGRAL_AUTHORITY / np.where(per_axis > 0.0, per_axis, 1.0), 0.0
+        )
         self._integral = np.zeros_like(per_axis)
 
     def start(self, which: np.ndarray) -> None:
@@ -93,5 +95,3 @@ class ManyLqrIntegral:
 def _plain(law: Cascades, zeta: np.ndarray, attitude: np.ndarray, reference: References) -> Steps:
     rates = law.turning(zeta, law.euler_rates(zeta, attitude, reference.yaw))
     return Steps.plain(attitude[2], rates, law.normalised(attitude[2]))
-
-

@@ -11,7 +11,7 @@ import numpy as np
 from trueflight.models.trajectory import ReferenceSample, Trajectory
 from trueflight.sim_bridge.plan import Plan, legs_of
 
-_AT_A_TIME = 256  # ticks that are sampled together
+_AT_A_TIME = 512  # ticks that are sampled together
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,13 @@ class Courses:
     trajectory begins; after its end a flight's reference goes on as its last leg ends."""
 
     def __init__(self, plans: Sequence[Plan], period: float) -> None:
-        self._courses = [_Course(plan, period) for plan in plans]
+        # Flights of one course have one, which is then sampled once.
+        known: dict[tuple[int, int, float], _Course] = {}
+        keys = [(id(plan.trajectory), plan.repeat, plan.settle) for plan in plans]
+        self._courses = [
+            known.setdefault(key, known.get(key) or _Course(plan, period))
+            for key, plan in zip(keys, plans, strict=True)
+        ]
         self.ticks = np.array([course.ticks for course in self._courses])
         self.settling = np.array([course.settling for course in self._courses])
         self._period = period
@@ -105,10 +111,14 @@ class Courses:
         return rows
 
     def _sampled(self, tick: int, ahead: np.ndarray) -> np.ndarray:
-        out = np.empty((len(self._courses), _AT_A_TIME, 10))
-        for rows, course, later in zip(out, self._courses, ahead.tolist(), strict=True):
-            course.rows(tick, _AT_A_TIME, later, rows)
-        return np.ascontiguousarray(out.transpose(1, 2, 0))
+        pairs = list(zip(self._courses, ahead.tolist(), strict=True))
+        slots = {pair: slot for slot, pair in enumerate(dict.fromkeys(pairs))}
+        sampled = np.empty((len(slots), _AT_A_TIME, 10))
+        for (course, later), slot in slots.items():
+            course.rows(tick, _AT_A_TIME, later, sampled[slot])
+        which = np.array([slots[pair] for pair in pairs])
+        turned = np.ascontiguousarray(sampled.transpose(1, 2, 0))
+        return turned if len(slots) == len(pairs) else turned[:, :, which]
 
 
 def _flat(sample: ReferenceSample) -> tuple[float, ...]:

@@ -39,29 +39,36 @@ class Samples:
     under_way: np.ndarray
 
 
-def fly_many(plans: Sequence[Plan], on_samples: Callable[[Samples], None] | None = None) -> list[Flown]:
+def fly_many(
+    plans: Sequence[Plan],
+    on_samples: Callable[[Samples], None] | None = None,
+    on_end: Callable[[int, Flown], None] | None = None,
+) -> list[Flown]:
     """Fly plans of one control rate together, each from hover at the start of its trajectory.
 
-    `on_samples` is called once a control tick, until the last flight has ended. The figures of each flight are those of
+    `on_samples` is called once a control tick, until the last flight has ended; `on_end` when a flight has, with its
+    index (`wall` is not known yet then). The figures of each flight are those of
     `sim_bridge.in_process.fly`; `wall` is its share of the time that all took. Raises `InputError` for a design or a
     model that belongs to another vehicle, and for rates that differ.
     """
     if len({plan.rate for plan in plans}) != 1:
         raise InputError("flights of one batch need one --rate")
     begin = time.perf_counter()
-    flight = _Flight(plans)
+    flight = _Flight(plans, on_end)
     with np.errstate(all="ignore"):  # a flight that is lost may go on to absurd numbers beside the others
         while flight.under_way.any():
             flight.tick(on_samples)
     wall = time.perf_counter() - begin
-    seconds = sum(flown.simulated for flown in flight.results())
-    return [replace(f, wall=wall * f.simulated / seconds) for f in flight.results()]
+    results = [flight.result(i) for i in range(len(plans))]
+    seconds = sum(flown.simulated for flown in results)
+    return [replace(f, wall=wall * f.simulated / seconds) for f in results]
 
 
 class _Flight:
     """N flights under way."""
 
-    def __init__(self, plans: Sequence[Plan]) -> None:
+    def __init__(self, plans: Sequence[Plan], on_end: Callable[[int, Flown], None] | None = None) -> None:
+        self._on_end = on_end
         count, self._steps = len(plans), plans[0].steps_per_tick
         self._plans = plans
         self._period = self._steps * PHYSICS_STEP
@@ -101,21 +108,12 @@ class _Flight:
         self._tick += 1
         vehicles.fly(steps.thrust_command, steps.body_rate)
 
-    def results(self) -> list[Flown]:
-        """How each flight went."""
-        rms = np.sqrt(self._squares / self._ticks)
-        return [
-            Flown(
-                self._outcomes[i],
-                int(self._ticks[i]),
-                float(self._ticks[i] * self._period),
-                0.0,
-                (float(rms[0, i]), float(rms[1, i]), float(rms[2, i])),
-                self._last_guard[i],
-                int(self._touching[i]),
-            )
-            for i in range(len(self._plans))
-        ]
+    def result(self, i: int) -> Flown:
+        """How a flight went."""
+        x, y, z = np.sqrt(self._squares[:, i] / self._ticks[i]).tolist()
+        ticks = int(self._ticks[i])
+        simulated, touching = ticks * self._period, int(self._touching[i])
+        return Flown(self._outcomes[i], ticks, simulated, 0.0, (x, y, z), self._last_guard[i], touching)
 
     def _commanded(self, estimates: Estimates, position: np.ndarray, references: References) -> Steps:
         states = States(
@@ -171,6 +169,8 @@ class _Flight:
             self._outcomes[i] = "lost" if lost[i] else "crashed" if crashed[i] else "finished"
             self._last_guard[i] = self._guard[i]
             self._vehicles.park(i)
+            if self._on_end is not None:
+                self._on_end(i, self.result(i))
         self.under_way = here & ~gone
 
 

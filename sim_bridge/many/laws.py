@@ -75,8 +75,8 @@ class _Pass:
 class Laws:
     """The formulas of many vehicles, in an order that is each vehicle's own: `acting` lists those of each of N.
 
-    `motion` (26, N) and `thrusts` (4, N) are as in `Airframes`. What was at work `before` and still is goes on with what
-    it remembers.
+    `motion` (26, N) and `thrusts` (4, N) are as in `Airframes`. What was at work `before` and still is goes on with
+    what it remembers.
     """
 
     def __init__(

@@ -41,10 +41,11 @@ class RateLoops:
     def relative(self, command: np.ndarray) -> np.ndarray:
         """Believed thrust over hover thrust of normalised collective commands (N,)."""
         ratio = command / self._hover
-        return np.where(self._linear, ratio, ratio * ratio)
+        relative: np.ndarray = np.where(self._linear, ratio, ratio * ratio)
+        return relative
 
     def motors(self, relative: np.ndarray, setpoint: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Motor commands (4, N) for thrusts `relative` to hover (N,) and body-rate setpoints (3, N), at `rate` (3, N)."""
+        """Motor commands (4, N) for thrusts `relative` to hover (N,), body-rate setpoints (3, N) and rates (3, N)."""
         slope, asked = self._slope, self._asked
         change = rate - self._rate
         change /= PHYSICS_STEP

@@ -42,9 +42,7 @@ class Sensing:
         self._sensors, self._bodies, self._frames = sensors, bodies, frames
         self._period_us = round(PHYSICS_STEP * 1e6) * steps_per_tick
         noises = [one.noise for one in sensors]
-        white = (
-            (n.position, n.velocity, 0.5 * n.attitude, n.gyroscope, n.accelerometer) for n in noises
-        )
+        white = ((n.position, n.velocity, 0.5 * n.attitude, n.gyroscope, n.accelerometer) for n in noises)
         self._white = np.repeat(stacked(list(white)), 3, axis=0).reshape(15, -1)
         slow = ((n.position_wander, n.velocity_wander, 0.5 * n.attitude_wander) for n in noises)
         self._slow = np.repeat(stacked(list(slow)), 3, axis=0).reshape(9, -1)
@@ -55,7 +53,9 @@ class Sensing:
         self._bias = stacked([one.accelerometer_bias for one in sensors])
         arms = [one.lever_arm for one in sensors]
         self._armed = np.flatnonzero([arm is not None for arm in arms])
-        self._arms = stacked([arm for arm in arms if arm is not None]) if len(self._armed) else np.zeros((3, 0))
+        self._arms = (
+            stacked([arm for arm in arms if arm is not None]) if len(self._armed) else np.zeros((3, 0))
+        )
         self._samples = 0
         self._block = np.empty((len(sensors), BLOCK, DRAWS))
         self._turned = np.empty((_AT_A_TIME, DRAWS, len(sensors)))
@@ -110,7 +110,11 @@ class Sensing:
         if where is None:
             position, velocity = bodies.position, bodies.velocity
         else:
-            position, velocity, motion = bodies.position[:, where], bodies.velocity[:, where], motion[:, where]
+            position, velocity, motion = (
+                bodies.position[:, where],
+                bodies.velocity[:, where],
+                motion[:, where],
+            )
         out = np.concatenate(
             (position, velocity, (velocity[:3] - motion[3:6]) * (1.0 / PHYSICS_STEP), motion[12:])
         )
@@ -132,11 +136,12 @@ class Sensing:
             end = BLOCK - at
             self._turned[:] = self._block[:, end - _AT_A_TIME : end].transpose(1, 2, 0)[::-1]
         self._samples += 1
-        return self._turned[at % _AT_A_TIME]
+        drawn: np.ndarray = self._turned[at % _AT_A_TIME]
+        return drawn
 
 
 def _swing(moments: np.ndarray, before: np.ndarray, arm: np.ndarray) -> np.ndarray:
-    """Acceleration (world, m/s²) of points of the bodies, `arm` (3, n) from their centres of mass, over the last step."""
+    """Acceleration (world, m/s²) over the last step of points of the bodies, `arm` (3, n) from the centres of mass."""
     now = _rotations(moments[3:7])
     then = before[12:21].reshape(3, 3, -1)
     after, earlier = _cross(moments[10:13], arm), _cross(before[9:12], arm)

@@ -1,4 +1,4 @@
-"""Many simulated vehicles: bodies, air, rotors, inner loops and sensors, stepped together; `Simulator` is one of them."""
+"""Many simulated vehicles: bodies, air, rotors, inner loops, sensors, stepped together; `Simulator` is one of them."""
 
 from __future__ import annotations
 

@@ -8,10 +8,12 @@ Hidden effects change its numbers or act in `on_rotors` and `on_body`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from typing import Any
+
+import numpy as np
 
 from trueflight.models.vehicle import Vehicle
 from trueflight.sim_bridge.truth.battery import Battery, BatteryCell, battery_for
@@ -111,6 +113,15 @@ class Acting:
     numbers: tuple[Any, ...]
 
 
+def by_rotor(hubs: Sequence[Sequence[Any]]) -> tuple[np.ndarray, ...]:
+    """Numbers of each rotor, floats or arrays (n,), as arrays (rotors, 1) or (rotors, n): x, y, z of hubs."""
+    found = []
+    for column in zip(*hubs, strict=True):
+        rows = np.broadcast_arrays(*(np.atleast_1d(np.asarray(number, dtype=float)) for number in column))
+        found.append(np.stack(rows))
+    return tuple(found)
+
+
 class Airframe:
     """The vehicle's rotors in air.
 
@@ -147,10 +158,10 @@ class Airframe:
         self.on_rotors.append(law(*numbers))
         self.rotor_laws.append(Acting(many or law, numbers))
 
-    def act_on_body(self, law: Law, *numbers: Any) -> None:
-        """Let a formula act on the body's force and torque."""
+    def act_on_body(self, law: Law, *numbers: Any, many: Law | None = None) -> None:
+        """Let a formula act on the body's force and torque; `many` where it has another form for arrays."""
         self.on_body.append(law(*numbers))
-        self.body_laws.append(Acting(law, numbers))
+        self.body_laws.append(Acting(many or law, numbers))
 
     def keep(self) -> None:
         """Remember what acts now as what acts at every take-off."""

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from trueflight.models.vehicle import Vehicle
-from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion, by_rotor
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -56,12 +56,12 @@ def below_ceiling(square: float, height: float, hubs: Any) -> Act:
 
 
 def many_below_ceiling(square: Any, height: Any, hubs: Any) -> Act:
-    """The same for many vehicles."""
+    """The same for many vehicles, of all rotors at once."""
+    x, y, up = by_rotor(hubs)
 
     def act(m: Motion) -> None:
-        for i, (x, y, up) in enumerate(hubs):
-            distance = height - (m.z + m.r20 * x + m.r21 * y + m.r22 * up)
-            m.thrusts[i] /= 1.0 - np.minimum(square / (np.maximum(distance, 0.0) + 0.0378) ** 2, 0.5)
+        distance = height - (m.z + m.r20 * x + m.r21 * y + m.r22 * up)
+        m.thrusts /= 1.0 - np.minimum(square / (np.maximum(distance, 0.0) + 0.0378) ** 2, 0.5)
 
     return act
 

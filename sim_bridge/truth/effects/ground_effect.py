@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion, by_rotor
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -77,22 +77,24 @@ def images(half_square: float, least: float, ceiling: float, hubs: Any, pairs: A
 
 
 def many_images(half_square: Any, least: Any, ceiling: Any, hubs: Any, pairs: Any) -> Act:
-    """The same for many vehicles."""
+    """The same for many vehicles, of all rotors at once."""
+    x, y, up = by_rotor(hubs)
+    apart = by_rotor([[between] for _, _, between in pairs])[0]
+    one, other = [i for i, _, _ in pairs], [j for _, j, _ in pairs]
 
     def act(m: Motion) -> None:
         near = m.z <= ceiling
         if not np.any(near):
             return
-        heights = [np.maximum(m.z + m.r20 * x + m.r21 * y + m.r22 * up, least) for x, y, up in hubs]
-        sums = [0.125 / (h * h) for h in heights]
-        for i, j, apart in pairs:
-            h = 0.5 * (heights[i] + heights[j])
-            square = apart + 4.0 * h * h
-            image = h / (square * np.sqrt(square))
-            sums[i] = sums[i] + image
-            sums[j] = sums[j] + image
-        for i, total in enumerate(sums):
-            m.thrusts[i] /= 1.0 - near * np.minimum(half_square * total, 0.5)
+        heights = np.maximum(m.z + m.r20 * x + m.r21 * y + m.r22 * up, least)
+        sums = 0.125 / (heights * heights)
+        h = 0.5 * (heights[one] + heights[other])
+        square = apart + 4.0 * h * h
+        image = h / (square * np.sqrt(square))
+        for pair, (i, j, _) in zip(image, pairs, strict=True):
+            sums[i] += pair
+            sums[j] += pair
+        m.thrusts /= 1.0 - near * np.minimum(half_square * sums, 0.5)
 
     return act
 

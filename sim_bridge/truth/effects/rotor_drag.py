@@ -5,8 +5,10 @@ from __future__ import annotations
 import random
 from typing import Any, ClassVar
 
+import numpy as np
+
 from trueflight.models.vehicle import Vehicle
-from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion, by_rotor
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -44,7 +46,7 @@ def attach_rotor_drag(airframe: Airframe, x_per_s: float, y_per_s: float) -> Non
     """Let the H-force of four rotors act, given as acceleration per speed (1/s) when all turn at hover speed."""
     per_rotor = airframe.vehicle.mass / (4 * airframe.powertrain.hover_speed)
     hubs = tuple(airframe.vehicle.rotor_positions)
-    airframe.act_on_body(h_force, x_per_s * per_rotor, y_per_s * per_rotor, hubs)
+    airframe.act_on_body(h_force, x_per_s * per_rotor, y_per_s * per_rotor, hubs, many=many_h_forces)
 
 
 def h_force(cx: Any, cy: Any, hubs: Any) -> Act:
@@ -67,6 +69,26 @@ def h_force(cx: Any, cy: Any, hubs: Any) -> Act:
         body[3] += tx
         body[4] += ty
         body[5] += tz
+
+    return act
+
+
+def many_h_forces(cx: Any, cy: Any, hubs: Any) -> Act:
+    """The same for many vehicles, of all rotors at once."""
+    x, y, z = by_rotor(hubs)
+
+    def act(m: Motion) -> None:
+        p, q, r = m.p, m.q, m.r
+        hx = (q * z - r * y + m.u) * m.speeds
+        hx *= -cx
+        hy = (r * x - p * z + m.v) * m.speeds
+        hy *= -cy
+        body = m.wrench
+        body[0] += np.add.reduce(hx)
+        body[1] += np.add.reduce(hy)
+        body[3] -= np.add.reduce(z * hy)
+        body[4] += np.add.reduce(z * hx)
+        body[5] += np.add.reduce(x * hy - y * hx)
 
     return act
 

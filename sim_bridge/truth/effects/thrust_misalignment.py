@@ -7,8 +7,10 @@ import random
 from math import sqrt
 from typing import Any, ClassVar
 
+import numpy as np
+
 from trueflight.models.vehicle import Vehicle
-from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion, by_rotor
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -34,7 +36,7 @@ class ThrustMisalignment(TruthEffect):
         sx, sy = math.sin(numbers["x"]), math.sin(numbers["y"])
         short = 1.0 - sqrt(1.0 - sx * sx - sy * sy)
         hubs = tuple(airframe.vehicle.rotor_positions)
-        airframe.act_on_body(leaning, sx, sy, short, hubs)
+        airframe.act_on_body(leaning, sx, sy, short, hubs, many=many_leaning)
 
 
 def leaning(sx: Any, sy: Any, short: Any, hubs: Any) -> Act:
@@ -50,6 +52,24 @@ def leaning(sx: Any, sy: Any, short: Any, hubs: Any) -> Act:
             body[3] += y * fz - z * fy
             body[4] += z * fx - x * fz
             body[5] += x * fy - y * fx
+
+    return act
+
+
+def many_leaning(sx: Any, sy: Any, short: Any, hubs: Any) -> Act:
+    """The same for many vehicles, of all rotors at once."""
+    x, y, z = by_rotor(hubs)
+
+    def act(m: Motion) -> None:
+        total, along, across = (np.add.reduce(part) for part in (m.thrusts, x * m.thrusts, y * m.thrusts))
+        up = np.add.reduce(z * m.thrusts)
+        body = m.wrench
+        body[0] += sx * total
+        body[1] += sy * total
+        body[2] -= short * total
+        body[3] += -short * across - sy * up
+        body[4] += sx * up + short * along
+        body[5] += sy * along - sx * across
 
     return act
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import Act, Airframe, Motion, by_rotor
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -28,7 +28,7 @@ class TranslationalLift(TruthEffect):
         """A quarter of the gain at every hub, with the velocity that the body's rates give the hub."""
         gain = 0.25 * airframe.vehicle.mass * numbers["lift"]
         hubs = tuple(airframe.vehicle.rotor_positions)
-        airframe.act_on_rotors(with_edgewise_flow, gain, hubs)
+        airframe.act_on_rotors(with_edgewise_flow, gain, hubs, many=many_with_edgewise_flow)
 
 
 def with_edgewise_flow(gain: Any, hubs: Any) -> Act:
@@ -40,6 +40,17 @@ def with_edgewise_flow(gain: Any, hubs: Any) -> Act:
         for i, (x, y, z) in enumerate(hubs):
             hx, hy = u + q * z - r * y, v + r * x - p * z
             thrusts[i] += gain * (hx * hx + hy * hy)
+
+    return act
+
+
+def many_with_edgewise_flow(gain: Any, hubs: Any) -> Act:
+    """The same for many vehicles, of all rotors at once."""
+    x, y, z = by_rotor(hubs)
+
+    def act(m: Motion) -> None:
+        hx, hy = m.u + m.q * z - m.r * y, m.v + m.r * x - m.p * z
+        m.thrusts += gain * (hx * hx + hy * hy)
 
     return act
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from trueflight.sim_bridge.truth.airframe import AIR_DENSITY, Act, Airframe, Motion
+from trueflight.sim_bridge.truth.airframe import AIR_DENSITY, Act, Airframe, Motion, by_rotor
 from trueflight.sim_bridge.truth.effect import TruthEffect
 from trueflight.sim_bridge.truth.sensors import Sensors
 
@@ -55,16 +55,17 @@ def in_own_wake(loss: float, induced: float, hubs: Any) -> Act:
 
 
 def many_in_own_wake(loss: Any, induced: Any, hubs: Any) -> Act:
-    """The same for many vehicles."""
+    """The same for many vehicles, of all rotors at once."""
+    x, y, _ = by_rotor(hubs)
 
     def act(m: Motion) -> None:
-        flat = loss * np.maximum(1.0 - np.sqrt(m.u * m.u + m.v * m.v) / induced, 0.0)
-        if not np.any(flat):
+        sinking = m.q * x - m.p * y - m.w
+        sinking /= induced
+        if not np.any(sinking > 0.3):
             return
-        for i, (x, y, _) in enumerate(hubs):
-            sinking = -(m.w + m.p * y - m.q * x) / induced
-            ring = 0.5 - 0.5 * np.cos(2.0 * math.pi * (np.clip(sinking, 0.3, 1.5) - 0.3) / 1.2)
-            m.thrusts[i] *= 1.0 - flat * ring
+        flat = loss * np.maximum(1.0 - np.sqrt(m.u * m.u + m.v * m.v) / induced, 0.0)
+        ring = 0.5 - 0.5 * np.cos(2.0 * math.pi * (np.clip(sinking, 0.3, 1.5) - 0.3) / 1.2)
+        m.thrusts *= 1.0 - flat * ring
 
     return act
 
