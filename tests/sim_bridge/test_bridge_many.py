@@ -179,9 +179,9 @@ def test_flights_that_end_early(vehicle: Vehicle, design: Design) -> None:
             Plan(
                 vehicle,
                 design,
-                trajectory("hover", height=0.1, duration=1.0),
-                choose(["thrust_gain:0.96"], vehicle, 3),
-                3,
+                trajectory("hover", height=0.1, duration=1.5),
+                choose(["thrust_gain:0.93"], vehicle, 4),
+                4,
             ),
             Plan(vehicle, design, path, (), 4),
         ],
