@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from trueflight.groundstation.export.target import Line, Written
     from trueflight.models.model import Model
 
-ONNX = "onnx"
-"""The target that is no other program's: the companion's own file."""
 BELIEVED = "linear"
 """In place of a version: the vehicle file alone, as everywhere."""
 _COLOURS = {"whole": "green", "roughly": "yellow", "not": "red"}
@@ -75,20 +73,22 @@ def export_elsewhere(
                 "bytes": len(data),
                 "not_exported": [line.effect for line in written.lines if line.held == "not"],
                 "actuation": {},
-                "effects": [_row(line) for line in written.lines],
+                "effects": [row_of(line) for line in written.lines],
                 "notes": list(written.notes),
             }
         )
         return
     console.print(f"{escape(str(output))}: {model.label} for {target_named(to).title}")
-    _print_lines(console, written)
+    print_lines(console, written)
 
 
-def _row(line: Line) -> dict[str, str]:
+def row_of(line: Line) -> dict[str, str]:
+    """What became of an effect, as JSON has it."""
     return {"effect": line.effect, "held": line.held, "how": line.how}
 
 
-def _print_lines(console: Console, written: Written) -> None:
+def print_lines(console: Console, written: Written) -> None:
+    """What became of each effect, and what was assumed."""
     for line in written.lines:
         held = f"[{_COLOURS[line.held]}]{line.held:8}[/]"
         console.print(f"  {held}{escape(line.effect)}: {escape(line.how)}", highlight=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +9,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from trueflight.groundstation.commands.elsewhere import ONNX, chosen, export_elsewhere, only_vehicle
+from trueflight.groundstation.commands.correction import CORRECTIONS, ONNX, export_correction
+from trueflight.groundstation.commands.elsewhere import chosen, export_elsewhere, only_vehicle
 from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
     BandwidthOption,
@@ -27,7 +27,6 @@ from trueflight.groundstation.commands.options import (
 from trueflight.groundstation.output.terminal import print_written, working
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
-from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
     from trueflight.models.flight import Flight
@@ -249,13 +248,14 @@ def model_export(
     to: Annotated[
         str,
         typer.Option(
-            help="onnx, for the companion; or mujoco, rotorpy, crazyflow, gazebo, px4, px4-sih, casadi, sympy."
+            help="onnx, for the companion; c, for an autopilot; or mujoco, rotorpy, crazyflow, gazebo, px4, px4-sih, "
+            "casadi, sympy."
         ),
     ] = ONNX,
     flight: Annotated[
         list[Path] | None,
         typer.Option(
-            "--flight", help="For onnx: gives training range, golden vectors and actuation. Repeatable."
+            "--flight", help="For onnx and c: gives training range, golden vectors and actuation. Repeatable."
         ),
     ] = None,
     vehicle: VehicleOption = None,
@@ -265,85 +265,24 @@ def model_export(
         str, typer.Option("--vehicle-name", help="Name of the vehicle, for a version number.")
     ] = "",
     hover_speed: Annotated[
-        float | None, typer.Option(help="Speed of the rotors in a hover, rad/s; not for onnx.")
+        float | None, typer.Option(help="Speed of the rotors in a hover, rad/s; for other simulators.")
     ] = None,
     torque_length: Annotated[
-        float | None, typer.Option(help="Drag torque of a rotor over its thrust, m; not for onnx.")
+        float | None, typer.Option(help="Drag torque of a rotor over its thrust, m; for other simulators.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a version as one file: for the companion, or for another simulator, autopilot or solver.
 
     An ONNX file has its contract and is ready to deploy; what the flights show of the rate loop goes with it: the
-    corrected controller looks ahead over it. Of the others each says of every effect whether it holds it.
+    corrected controller looks ahead over it. A C header computes the same on the autopilot itself. Of the others each
+    says of every effect whether it holds it.
 
     Examples: groundstation model export v2 --flight identify.csv -o correction.onnx; groundstation model export v2 --to
     mujoco -o vehicle.xml
     """
-    if to == ONNX:
-        _export_onnx(which, flight or [], output, vehicle, mapping, store, as_json)
+    if to in CORRECTIONS:
+        export_correction(console, which, to, flight or [], output, vehicle, mapping, store, as_json)
         return
     model = chosen(to, which, vehicle, name, store)
     export_elsewhere(console, model, to, output, hover_speed, torque_length, as_json)
-
-
-def _export_onnx(
-    which: str,
-    flight: Sequence[Path],
-    output: Path,
-    vehicle: Path | None,
-    mapping: list[str] | None,
-    store: Path,
-    as_json: bool,
-) -> None:
-    from trueflight.groundstation.identify.actuation import actuation_of
-    from trueflight.groundstation.reading import read_flight
-    from trueflight.groundstation.versions.choice import check_vehicle
-    from trueflight.groundstation.versions.store import find
-    from trueflight.models.contract import model_hash
-    from trueflight.models.export import export_onnx, not_exported
-
-    if not flight:
-        raise InputError("onnx: pass --flight, which gives training range and golden vectors")
-    flights = [read_flight(path, vehicle, mapping) for path in flight]
-    model = find(store, flights[0].vehicle.name, which)
-    for one in flights:
-        check_vehicle(model, one)
-    actuation = actuation_of(model, flights)
-    data = export_onnx(model, *flights, actuation=actuation)
-    write_whole(output, data, "the model", "choose another -o")
-    left = not_exported(model)
-    if as_json:
-        print_json(
-            {
-                "path": str(output),
-                "to": ONNX,
-                "hash": model_hash(data),
-                "bytes": len(data),
-                "not_exported": list(left),
-                "actuation": actuation,
-                "effects": [],
-                "notes": [],
-            }
-        )
-        return
-    console.print(f"{output}: {model.label}, {len(data) / 1000:.0f} kB, hash {model_hash(data)}")
-    _print_exported(actuation, left)
-
-
-def _print_exported(actuation: Mapping[str, float], left: Sequence[str]) -> None:
-    rates = (
-        f"rates {1e3 * actuation['rate_delay']:.0f} ms delay and {1e3 * actuation['rate_lag']:.0f} ms lag"
-        if "rate_lag" in actuation
-        else "nothing of the rate loop (these flights do not show it)"
-    )
-    console.print(
-        f"looks ahead over: thrust {1e3 * actuation['thrust_delay']:.0f} ms delay and "
-        f"{1e3 * actuation['thrust_lag']:.0f} ms lag, {rates}",
-        highlight=False,
-    )
-    if left:
-        console.print(
-            f"not in it, for a static correction has no memory and no sensor: {', '.join(left)}",
-            style="yellow",
-        )

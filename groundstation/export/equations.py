@@ -11,7 +11,7 @@ The effects' own formulas are traced: what is fitted is what is written down.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -67,7 +67,8 @@ def equations(model: Model) -> Equations:
     (voltage,) = _symbols(VOLTAGE)
     motion = _motion(model, velocity, quaternion, height, GRAVITY * speed**2, voltage)
     chain, values, lines = _chain(model)
-    moved = _traced(motion, chain)
+    whole = cast(Symbolic, traced(lambda: acceleration(apply_effects(motion, chain)), motion, chain))
+    moved = tuple(sympy.sympify(one) for one in whole.values[0])
     parameters = dict(values)
     if any(voltage in e.free_symbols for e in moved):
         parameters[voltage] = model.vehicle.nominal_voltage
@@ -167,9 +168,12 @@ def _otherwise(effect: Effect) -> Line:
     )
 
 
-def _traced(motion: Motion, chain: list[tuple[Effect, dict[str, Any]]]) -> tuple[sympy.Expr, ...]:
-    """Acceleration in the world under gravity, three expressions."""
-    for effect, values in chain:  # each by itself first, so that a message names the one that cannot
+def traced(
+    whole: Callable[[], Array], motion: Motion, chain: Sequence[tuple[Effect, Mapping[str, Any]]]
+) -> Array:
+    """What `whole` makes of a `motion` in symbols, with every effect of the `chain` tried by itself first, so that a
+    message names the one that cannot be traced. Raises `InputError` with it."""
+    for effect, values in chain:
         try:
             effect.apply(motion.with_(thrust_acceleration=motion.force), values)
         except NoSymbol as error:
@@ -179,5 +183,4 @@ def _traced(motion: Motion, chain: list[tuple[Effect, dict[str, Any]]]) -> tuple
                 f"{effect.name}: its formula takes no symbols ({type(error).__name__}: {error}); write it with "
                 "array_namespace alone, or export to onnx instead"
             ) from None
-    moved = cast(Symbolic, acceleration(apply_effects(motion, chain)))
-    return tuple(sympy.sympify(one) for one in moved.values[0])
+    return whole()

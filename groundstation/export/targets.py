@@ -42,7 +42,7 @@ TARGETS: dict[str, Target] = {
 def target_named(name: str) -> Target:
     """A target by name; raises `InputError` with the names for any other."""
     if name not in TARGETS:
-        raise InputError(f"--to {name}: no such target; there are onnx, {', '.join(TARGETS)}")
+        raise InputError(f"--to {name}: no such target; there are onnx, c, {', '.join(TARGETS)}")
     return TARGETS[name]
 
 

@@ -133,12 +133,13 @@ def train(
 def export(
     flights: columns.Flight | Sequence[columns.Flight], output: str | Path, *, model: versions.Model
 ) -> Path:
-    """Write a `model` to `output` as one ONNX file with its contract, ready to deploy.
+    """Write a `model` to `output` as one ONNX file with its contract, ready to deploy; as C where it ends with `.h`.
 
     From the `flights` come the range in which it may be trusted, the examples that the companion checks it by, and
     the delay and lag (s) of the rate loop. Returns the path. Raises `InputError` for a flight of another vehicle, and
     where the file cannot be written.
     """
+    from trueflight.groundstation.export import correction_c
     from trueflight.groundstation.identify.actuation import actuation_of
     from trueflight.models.export import export_onnx
     from trueflight.models.whole_file import write_whole
@@ -148,6 +149,8 @@ def export(
         check_vehicle(model, flight)
     _first(flown)
     data = export_onnx(model, *flown, actuation=actuation_of(model, flown))
+    if Path(output).suffix == correction_c.ENDING:
+        data = correction_c.write(model, correction_c.deployed(data)).text.encode()
     write_whole(Path(output), data, "the model", "choose another output")
     return Path(output)
 
