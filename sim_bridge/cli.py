@@ -6,7 +6,7 @@ import typer
 
 from trueflight.models.errors import run_command_line
 from trueflight.models.program import offer_version
-from trueflight.sim_bridge.commands import answers, collect, fly, run, sitl
+from trueflight.sim_bridge.commands import answers, collect, fly, fly_many, run, sitl
 
 app = typer.Typer(
     name="sim-bridge",
@@ -18,6 +18,7 @@ app = typer.Typer(
 run.register(app)
 sitl.register(app)
 fly.register(app)
+fly_many.register(app)
 collect.register(app)
 answers.register(app)
 offer_version(app, "sim-bridge")

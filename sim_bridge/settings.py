@@ -97,15 +97,20 @@ def load_settings(config: Path | None, flags: dict[str, Any], free_speed: float 
     if free_speed is not None and not free:
         values["speed"] = free_speed
     settings = Settings(**values)
-    for name, (low, high) in _LIMITS.items():
-        if not low <= getattr(settings, name) <= high:
-            option = "--" + name.replace("_", "-")
-            raise InputError(f"{option} {getattr(settings, name):g} is outside {low:g} to {high:g}")
+    check_limits(settings)
     if free:
         settings = replace(settings, speed=0.0)
     if not settings.vehicle:
         raise InputError("no vehicle; pass --vehicle FILE, or set `vehicle` in the configuration file")
     return settings
+
+
+def check_limits(settings: Settings) -> None:
+    """Raise `InputError` for a number outside its range."""
+    for name, (low, high) in _LIMITS.items():
+        if not low <= getattr(settings, name) <= high:
+            option = "--" + name.replace("_", "-")
+            raise InputError(f"{option} {getattr(settings, name):g} is outside {low:g} to {high:g}")
 
 
 def _read(config: Path) -> dict[str, Any]:

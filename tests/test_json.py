@@ -95,6 +95,11 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_simulator(tmp_path: Path) -> None:
     assert run("sim-bridge effects")["schema"] == 1
+    told = run(
+        "sim-bridge fly-many", "--vehicle", VEHICLE, "--trajectory", "hover", "--set", "duration=1", "--seeds", 2,
+        "--hidden", "any", "-o", tmp_path / "many", "--tell-hidden", "--jobs", 1,
+    )  # fmt: skip
+    assert [flight["name"] for flight in told["flights"]] == ["0001", "0002"]
     run(
         "sim-bridge collect", "--vehicle", VEHICLE, "--minutes", 0.2, "--jobs", 1, "-o", tmp_path / "database"
     )

@@ -71,12 +71,16 @@ def calibrate_command(
     if again:
         forget_diagnoses(study)
     with counted(as_json) as progress:
-        task = progress.add_task("flying and diagnosing", total=len(wanted))
+        flying = progress.add_task("flying", total=len(wanted))
+        diagnosing = progress.add_task("diagnosing", total=len(wanted))
+
+        def flown(more: int) -> None:
+            progress.advance(flying, more)
 
         def done(case: Case) -> None:
-            progress.advance(task)
+            progress.advance(diagnosing)
 
-        cases = run(study, wanted, jobs or len(os.sched_getaffinity(0)), done)
+        cases = run(study, wanted, jobs or len(os.sched_getaffinity(0)), done, flown)
     result = calibrate(cases)
     asked = {"vehicle": cases[0].vehicle, "seed": seed, "seconds_usual": seconds, "strength": strength}
     table = {**asked, **calibration_table(result, cases)}

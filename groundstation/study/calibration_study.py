@@ -1,7 +1,8 @@
 """Seeded flights of known truth for the calibration of the diagnosis: drawn, flown and diagnosed, one folder a study.
 
 The flights are drawn here (what is hidden, how noisy the sensors are, where and how long the vehicle flies), flown by
-`sim-bridge fly` as another program, and diagnosed as any flight. What is done stays in the folder, one file a step.
+`sim-bridge fly-many` as another program, and diagnosed as any flight. What is done stays in the folder, one file a
+step.
 """
 
 from __future__ import annotations
@@ -348,56 +349,86 @@ def setpoints(path: Trajectory) -> str:
 # --- flying and diagnosing ------------------------------------------------------------------------------------------
 
 
-def command_of(study: Study, sortie: Sortie) -> list[str]:
-    """The words that fly a sortie."""
-    stem = study.folder / sortie.name
-    words: list[object] = ["sim-bridge", "fly", "--trajectory", f"{stem}.setpoints.csv"]
-    words += ["--vehicle", study.vehicle, "--design", study.design]
-    for name in sortie.hidden or ("none",):
-        at = f"@{sortie.begins[name]}" if name in sortie.begins else ""
-        words += ["--hidden", f"{name}{at}"]
-    words += [
-        "--strength",
-        study.strength * sortie.strength,
-        "--seed",
-        sortie.seed,
-        "--noise",
-        sortie.noise,
-        "--charge",
-        sortie.charge,
-    ]
-    words += ["--controller", sortie.controller]
-    words += ["--rotor-speeds" if sortie.rotor_speeds else "--no-rotor-speeds"]
-    words += ["-o", f"{stem}.mcap", "--sealed", f"{stem}.sealed", "--json"]
-    return [str(word) for word in words]
+TOGETHER = 256
+"""Flights that are flown at once; what an interruption loses at most."""
+_COLUMNS = [
+    "name",
+    "trajectory",
+    "hidden",
+    "strength",
+    "seed",
+    "noise",
+    "charge",
+    "controller",
+    "rotor_speeds",
+]
 
 
-def fly(study: Study, sortie: Sortie) -> dict[str, Any]:
-    """Fly a sortie, or tell of it where it has been flown: how it went, and what was hidden."""
-    stem = study.folder / sortie.name
-    kept = stem.with_suffix(".flight.json")
-    if kept.exists():
-        told = _read(kept)
-        if told.get("sortie") != json.loads(json.dumps(asdict(sortie))):
-            raise InputError(f"{kept}: was flown for another study; choose another --output")
-        return told
+def table_of(study: Study, some: Sequence[Sortie]) -> str:
+    """The CSV that `sim-bridge fly-many --flights` reads; setpoints lie beside it."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for sortie in some:
+        hidden = [f"{n}@{sortie.begins[n]}" if n in sortie.begins else n for n in sortie.hidden or ("none",)]
+        writer.writerow(
+            [sortie.name, f"{sortie.name}.setpoints.csv", ";".join(hidden), study.strength * sortie.strength]
+            + [sortie.seed, sortie.noise, sortie.charge, sortie.controller, str(sortie.rotor_speeds).lower()]
+        )
+    return out.getvalue()
+
+
+def fly(
+    study: Study, wanted: Sequence[Sortie], jobs: int, done: Callable[[int], None]
+) -> list[dict[str, Any]]:
+    """Fly all sorties that have not been flown, many at once: of each how it went, and what was hidden.
+
+    `done` hears how many more have been flown.
+    """
+    kept = {sortie.name: _kept(study, sortie) for sortie in wanted}
+    missing = [sortie for sortie in wanted if kept[sortie.name] is None]
+    done(len(wanted) - len(missing))
     vehicle = load_vehicle(study.vehicle)
-    # of a run that was killed before it could tell
-    stem.with_suffix(".mcap").unlink(missing_ok=True)
-    _write(stem.with_suffix(".setpoints.csv"), setpoints(path_of(sortie, vehicle)))
-    report = run_json(command_of(study, sortie))
-    truth = run_json(["sim-bridge", "reveal", stem.with_suffix(".sealed"), "--json"])
-    told = {
+    for begin in range(0, len(missing), TOGETHER):
+        some = missing[begin : begin + TOGETHER]
+        for sortie in some:
+            stem = study.folder / sortie.name
+            stem.with_suffix(".mcap").unlink(missing_ok=True)  # of a run that was killed before it could tell
+            _write(stem.with_suffix(".setpoints.csv"), setpoints(path_of(sortie, vehicle)))
+        table = study.folder / "flights.csv"
+        _write(table, table_of(study, some))
+        words: list[object] = ["sim-bridge", "fly-many", "--flights", table, "--vehicle", study.vehicle]
+        words += ["--design", study.design, "-o", study.folder, "--tell-hidden", "--jobs", jobs, "--json"]
+        reports = {report["name"]: report for report in run_json(words)["flights"]}
+        for sortie in some:
+            kept[sortie.name] = told = _told(sortie, reports[sortie.name], vehicle)
+            _write(study.folder / f"{sortie.name}.flight.json", json.dumps(told, indent=1))
+        table.unlink()
+        done(len(some))
+    return [told for told in kept.values() if told is not None]
+
+
+def _kept(study: Study, sortie: Sortie) -> dict[str, Any] | None:
+    """What is told of a sortie that has been flown."""
+    path = (study.folder / sortie.name).with_suffix(".flight.json")
+    if not path.exists():
+        return None
+    told = _read(path)
+    if told.get("sortie") != json.loads(json.dumps(asdict(sortie))):
+        raise InputError(f"{path}: was flown for another study; choose another --output")
+    return told
+
+
+def _told(sortie: Sortie, report: dict[str, Any], vehicle: Vehicle) -> dict[str, Any]:
+    return {
         "sortie": asdict(sortie),
         "outcome": report["outcome"],
         "seconds": report["simulated"],
         "ticks_on_ground": report["ticks_on_ground"],
-        "hidden": truth["effects"],
+        "hidden": report["hidden"],
         "vehicle": vehicle.name,
         "command_delay": vehicle.command_delay,
     }
-    _write(kept, json.dumps(told, indent=1))
-    return told
 
 
 def diagnose_record(study: Study, sortie: Sortie) -> dict[str, Any]:
@@ -423,22 +454,29 @@ def diagnose_record(study: Study, sortie: Sortie) -> dict[str, Any]:
     return told
 
 
-def _work(study: Study, sortie: Sortie) -> Case:
-    flown = fly(study, sortie)
+def _work(study: Study, sortie: Sortie, flown: dict[str, Any]) -> Case:
     finished = flown["outcome"] == "finished"
     diagnosis = diagnose_record(study, sortie) if finished else None
     return case_from_table(flown, diagnosis, load_vehicle(study.vehicle))
 
 
-def run(study: Study, wanted: Sequence[Sortie], jobs: int, done: Callable[[Case], None]) -> tuple[Case, ...]:
-    """Fly and diagnose what the folder lacks; `done` hears of each flight. In the order of `wanted`.
+def run(
+    study: Study,
+    wanted: Sequence[Sortie],
+    jobs: int,
+    done: Callable[[Case], None],
+    flown: Callable[[int], None] = lambda more: None,
+) -> tuple[Case, ...]:
+    """Fly what the folder lacks, then diagnose; `flown` hears how many more have been flown, `done` of each diagnosis.
+    In the order of `wanted`.
 
     With `jobs` 1 here, otherwise in so many processes. When interrupted, flights under way are finished and kept, and
     the rest is not begun.
     """
     cases: dict[int, Case] = {}
     try:
-        for case in _each(study, wanted, min(jobs, len(wanted))):
+        told = fly(study, wanted, jobs, flown)
+        for case in _each(study, list(zip(wanted, told, strict=True)), min(jobs, len(wanted))):
             cases[case.number] = case
             done(case)
     except BrokenProcessPool:
@@ -453,16 +491,16 @@ def run(study: Study, wanted: Sequence[Sortie], jobs: int, done: Callable[[Case]
     return tuple(cases[sortie.number] for sortie in wanted)
 
 
-def _each(study: Study, wanted: Sequence[Sortie], jobs: int) -> Iterator[Case]:
+def _each(study: Study, flown: Sequence[tuple[Sortie, dict[str, Any]]], jobs: int) -> Iterator[Case]:
     if jobs == 1:
-        yield from (_work(study, sortie) for sortie in wanted)
+        yield from (_work(study, sortie, told) for sortie, told in flown)
         return
     # each worker uses one core; the variables are read when the workers' numpy is loaded
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     with worker_pool(jobs) as pool:
         with interrupts_held():
-            begun = [pool.submit(_work, study, s) for s in wanted]
+            begun = [pool.submit(_work, study, sortie, told) for sortie, told in flown]
         yield from (one.result() for one in as_completed(begun))
 
 

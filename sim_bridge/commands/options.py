@@ -52,15 +52,21 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Draw:
-    """What is drawn, and where the answer goes."""
+class Drawn:
+    """What is drawn."""
 
     seed: Annotated[int | None, typer.Option(help="Of the draw and of the noise.")] = None
-    sealed: Annotated[
-        Path | None, typer.Option(help="Where the answer to `random`, `any` or `rich` goes, for `reveal`.")
-    ] = None
     noise: Annotated[
         float | None, typer.Option(help="Scale of sensor noise and estimator errors; 0: none.")
+    ] = None
+
+
+@dataclass(frozen=True)
+class Draw(Drawn):
+    """What is drawn, and where the answer goes."""
+
+    sealed: Annotated[
+        Path | None, typer.Option(help="Where the answer to `random`, `any` or `rich` goes, for `reveal`.")
     ] = None
 
 
@@ -70,13 +76,23 @@ BatteryAge = Annotated[
 
 
 @dataclass(frozen=True)
-class DrawAndBattery(Draw):
-    """What is drawn, and the battery at the start."""
+class Battery:
+    """The battery at the start."""
 
     charge: Annotated[
         float | None, typer.Option(help="The battery's state of charge at the start, 0 to 1.")
     ] = None
     battery_age: BatteryAge = None
+
+
+@dataclass(frozen=True)
+class DrawAndBattery(Battery, Draw):
+    """What is drawn, and the battery at the start."""
+
+
+@dataclass(frozen=True)
+class DrawnAndBattery(Battery, Drawn):
+    """What is drawn without a file for its answer, and the battery at the start."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +164,7 @@ class Flying:
 
 
 def settings_of(
-    owner: Owner, *groups: Wanted | Draw | OnMavlink, free_speed: float | None = None, **more: Any
+    owner: Owner, *groups: Wanted | Drawn | OnMavlink, free_speed: float | None = None, **more: Any
 ) -> Settings:
     """The settings by the configuration file and the flags of these groups; `free_speed` as in `load_settings`."""
     flags = asdict(owner)

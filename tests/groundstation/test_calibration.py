@@ -35,11 +35,11 @@ from trueflight.groundstation.study.calibration_study import (
     STRENGTHS,
     TOP,
     Study,
-    command_of,
     hideable,
     path_of,
     setpoints,
     sorties,
+    table_of,
 )
 from trueflight.groundstation.study.cases import begins_of, truth_of
 from trueflight.groundstation.study.logged import lagged, thinned
@@ -330,7 +330,7 @@ def test_more_flights_begin_with_the_same_and_hide_everything_equally_often(stud
         ((name, moment),) = s.begins.items()
         assert name in s.hidden and name in study.beginners
         assert 0.3 * s.seconds - 0.1 <= moment <= 0.75 * s.seconds + 0.1
-        assert f"{name}@{moment}" in command_of(study, s)
+        assert f"{name}@{moment}" in table_of(study, [s])
 
 
 def test_flights_are_long_enough_and_stay_below_the_ceiling(study: Study) -> None:
