@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+BLOCK = 8192
+"""Rows that are turned at once: what is computed between stays in the processor's cache."""
+
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3), body to world, of unit quaternions: `quaternion` (..., 4), w, x, y, z."""
@@ -24,12 +27,28 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Body vectors `vector` (..., 3) expressed in the world, with `quaternion` (..., 4) body to world."""
-    return np.einsum("...ij,...j->...i", rotation_matrix(quaternion), vector)
+    return _turned(quaternion, vector, 1.0)
 
 
 def rotate_inverse(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """World vectors `vector` (..., 3) expressed in the body, with `quaternion` (..., 4) body to world."""
-    return np.einsum("...ji,...j->...i", rotation_matrix(quaternion), vector)
+    return _turned(quaternion, vector, -1.0)
+
+
+def _turned(quaternion: np.ndarray, vector: np.ndarray, sign: float) -> np.ndarray:
+    """v + 2 u x (u x v + w v): `rotation_matrix` times v (`sign` 1) or its transpose (-1), without the matrices."""
+    quaternion, vector = np.asarray(quaternion, dtype=float), np.asarray(vector, dtype=float)
+    if quaternion.ndim == vector.ndim == 2 and BLOCK < len(quaternion) == len(vector):
+        out = np.empty(vector.shape)
+        for first in range(0, len(out), BLOCK):
+            rows = slice(first, first + BLOCK)
+            out[rows] = _turned(quaternion[rows], vector[rows], sign)
+        return out
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    a, b, c = np.moveaxis(vector, -1, 0)
+    w = sign * w
+    p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return np.stack([a + w * p + y * r - z * q, b + w * q + z * p - x * r, c + w * r + x * q - y * p], -1)
 
 
 def euler_from_quaternion(quaternion: np.ndarray) -> np.ndarray:

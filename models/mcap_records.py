@@ -92,6 +92,9 @@ class _Bounded:
         return data
 
 
+_ZSTD = zstandard.ZstdDecompressor()
+
+
 def _unpacked(chunk: Chunk) -> Chunk:
     """The chunk with its data uncompressed. Raises `ValueError` for one that unpacks to more than it says."""
     size = chunk.uncompressed_size
@@ -101,7 +104,7 @@ def _unpacked(chunk: Chunk) -> Chunk:
         claimed = zstandard.get_frame_parameters(chunk.data).content_size
         if claimed not in (zstandard.CONTENTSIZE_UNKNOWN, size):
             raise ValueError(f"a chunk claims {size} bytes and {claimed}")
-        data = zstandard.decompress(chunk.data, size)
+        data = _ZSTD.decompress(chunk.data, size)
     elif chunk.compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
     else:

@@ -6,7 +6,7 @@ all that have its form are then read at once, a field at a time. Wire format: ht
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +23,12 @@ _WIRE = {
     FieldDescriptor.TYPE_STRING: DELIMITED,
     FieldDescriptor.TYPE_MESSAGE: DELIMITED,
 }
+Into = Mapping[str, tuple[np.ndarray, float]]
+"""Where the fields of a path go, and what stands there for a message that has none."""
 MOST_FORMS = 64
 """Forms of messages of one length that are looked for in one batch before messages are put into the usual form."""
+MOST_REMEMBERED = 1000
+"""Forms that are remembered from batch to batch."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +43,12 @@ class _Slot:
 
 @dataclass(frozen=True)
 class _Form:
-    """`slots` of the fields present, `mask` (L,) of the bits that all messages of the form have in common, and the
-    submessages that are there, by path."""
+    """`slots` of the fields present, `mask` (L,) of the bits that all messages of the form have in common, what these
+    are (`fixed`), and the submessages that are there, by path."""
 
     slots: tuple[_Slot, ...]
     mask: np.ndarray
+    fixed: np.ndarray
     present: tuple[str, ...]
 
 
@@ -51,54 +56,72 @@ class Unusual(Exception):
     """A message that is whole, perhaps, but not as our own writer makes them."""
 
 
-def read_columns(
-    kind: type[Message],
-    messages: Sequence[memoryview],
-    into: Mapping[str, np.ndarray],
-    words: dict[str, int],
-) -> None:
-    """Write the fields of N `messages` of a `kind` into the arrays `into`, each (N,), by the field's path: position.x.
+class Columns:
+    """Reads messages of a `kind`, many at a time; what a message has not is `unknown` by its path.
 
-    Text is written as its number in `words`, which grows.
-
-    What a message has not stays as it was in the array; of a submessage that is there what it lacks is zero. Repeated
-    doubles go by index ("rotor_speed.0"). Raises what protobuf does for a message that is damaged.
+    `words` (text by its number) and the forms of messages that were seen are kept from one batch to the next.
     """
-    lengths = np.array([len(m) for m in messages])
-    for length in np.unique(lengths):
-        rows = np.flatnonzero(lengths == length)
-        block = np.frombuffer(b"".join(messages[int(i)] for i in rows), np.uint8).reshape(
-            len(rows), int(length)
-        )
-        for _ in range(MOST_FORMS):
-            if not len(rows):
-                break
-            try:
-                form = _form_of(kind.DESCRIPTOR, block[0].tobytes())
-            except Unusual:
-                same = np.all(block == block[0], axis=1)
-                _rewritten(kind, block[0].tobytes(), rows[same], into, words)
-            else:
-                same = np.all((block & form.mask) == (block[0] & form.mask), axis=1)
-                _fill(form, block if same.all() else block[same], rows[same], into, words)
-            rows, block = rows[~same], block[~same]
-        for row, data in zip(rows, block, strict=True):
-            _rewritten(kind, data.tobytes(), np.array([row]), into, words)
+
+    def __init__(self, kind: type[Message], unknown: Mapping[str, float]) -> None:
+        self._kind, self._unknown = kind, unknown
+        self.words = {"": 0}
+        self._forms: dict[int, list[_Form]] = {}
+
+    def read(
+        self, data: bytes, starts: np.ndarray, lengths: np.ndarray, columns: Mapping[str, np.ndarray]
+    ) -> None:
+        """Write the fields of the messages in `data` that begin at `starts` (N,) and have `lengths` (N,) bytes into
+        `columns`, each (N,), by the field's path: position.x.
+
+        Text is written as its number in `words`; of a submessage that is there what it lacks is zero. Repeated doubles
+        go by index ("rotor_speed.0"). Raises what protobuf does for a message that is damaged.
+        """
+        into = {path: (column, self._unknown[path]) for path, column in columns.items()}
+        for length in np.unique(lengths).tolist():
+            rows = np.flatnonzero(lengths == length)
+            block = _gathered(data, starts[rows], length)
+            for _ in range(MOST_FORMS):
+                if not len(rows):
+                    break
+                try:
+                    form = self._form(block[0])
+                except Unusual:
+                    same = np.all(block == block[0], axis=1)
+                    self._rewritten(block[0].tobytes(), rows[same], into)
+                else:
+                    same = np.all((block & form.mask) == form.fixed, axis=1)
+                    _fill(form, block if same.all() else block[same], rows[same], into, self.words)
+                rows, block = rows[~same], block[~same]
+            for row, one in zip(rows, block, strict=True):
+                self._rewritten(one.tobytes(), np.array([row]), into)
+
+    def _form(self, message: np.ndarray) -> _Form:
+        known = self._forms.setdefault(len(message), [])
+        for form in known:
+            if np.array_equal(message & form.mask, form.fixed):
+                return form
+        if sum(map(len, self._forms.values())) > MOST_REMEMBERED:  # a damaged file may have no two alike
+            self._forms, known = {}, []
+        form = _form_of(self._kind.DESCRIPTOR, message.tobytes())
+        self._forms[len(message)] = [*known, form]
+        return form
+
+    def _rewritten(self, data: bytes, rows: np.ndarray, into: Into) -> None:
+        """Read one message, by protobuf itself, that stands in all of `rows`."""
+        message = self._kind.FromString(data)
+        message.DiscardUnknownFields()
+        usual = message.SerializeToString(deterministic=True)
+        block = np.tile(np.frombuffer(usual, np.uint8), (len(rows), 1))
+        _fill(_form_of(self._kind.DESCRIPTOR, usual), block, rows, into, self.words)
 
 
-def _rewritten(
-    kind: type[Message],
-    data: bytes,
-    rows: np.ndarray,
-    into: Mapping[str, np.ndarray],
-    words: dict[str, int],
-) -> None:
-    """Read one message, by protobuf itself, that stands in all of `rows`."""
-    message = kind.FromString(data)
-    message.DiscardUnknownFields()
-    usual = message.SerializeToString(deterministic=True)
-    block = np.tile(np.frombuffer(usual, np.uint8), (len(rows), 1))
-    _fill(_form_of(kind.DESCRIPTOR, usual), block, rows, into, words)
+def _gathered(data: bytes, starts: np.ndarray, length: int) -> np.ndarray:
+    """The bytes (n, `length`) of messages of one length."""
+    if not length:
+        return np.empty((len(starts), 0), np.uint8)
+    whole = np.dtype((np.void, length))
+    every = np.ndarray((len(data) - length + 1,), whole, data, 0, (1,))  # one from each byte on
+    return every[starts].view(np.uint8).reshape(len(starts), length)
 
 
 def _form_of(kind: Descriptor, data: bytes) -> _Form:
@@ -108,7 +131,7 @@ def _form_of(kind: Descriptor, data: bytes) -> _Form:
     _walk(kind, data, 0, len(data), "", slots, present)
     for slot in slots:
         mask[slot.start : slot.stop] = 0x80 if slot.kind == VARINT else 0
-    return _Form(tuple(slots), mask, tuple(present))
+    return _Form(tuple(slots), mask, mask & np.frombuffer(data, np.uint8), tuple(present))
 
 
 def _walk(
@@ -163,27 +186,23 @@ def _varint(data: bytes, at: int, end: int) -> tuple[int, int]:
     raise Unusual
 
 
-def _fill(
-    form: _Form, block: np.ndarray, rows: np.ndarray, into: Mapping[str, np.ndarray], words: dict[str, int]
-) -> None:
-    """Write the fields of messages `block` (n, L) of one form into `rows` (n,)."""
+def _fill(form: _Form, block: np.ndarray, rows: np.ndarray, into: Into, words: dict[str, int]) -> None:
+    """Write the fields of messages `block` (n, L), contiguous and of one form, into `rows` (n,)."""
     own: Any = slice(int(rows[0]), int(rows[-1]) + 1) if rows[-1] - rows[0] + 1 == len(rows) else rows
     there = {slot.path for slot in form.slots}
-    for path in form.present:
-        for name, column in into.items():
-            if name.startswith(path) and name not in there and "." not in name[len(path) :]:
-                column[own] = 0.0
+    for path, (column, unknown) in into.items():
+        if path not in there:
+            column[own] = 0.0 if f"{path.rpartition('.')[0]}." in form.present else unknown
     for slot in form.slots:
         if slot.path not in into:
             continue
-        column = into[slot.path]
-        content = block[:, slot.start : slot.stop]
+        column, _ = into[slot.path]
         if slot.kind == FIXED64:
-            column[own] = np.ascontiguousarray(content).view("<f8")[:, 0]
+            column[own] = np.ndarray(len(block), "<f8", block.data, slot.start, block.strides[:1])
         elif slot.kind == VARINT:
-            column[own] = _integers(content)
+            column[own] = _integers(block[:, slot.start : slot.stop])
         else:
-            column[own] = _numbered(content, words)
+            column[own] = _numbered(block[:, slot.start : slot.stop], words)
 
 
 def _integers(content: np.ndarray) -> np.ndarray:

@@ -394,7 +394,7 @@ def _collect(stream: BinaryIO, raw: _Raw, damaged: list[str], ticks: bool) -> st
             elif isinstance(record, Schema | Channel):
                 kinds.note(record)
             elif isinstance(record, Message):
-                _take(memoryview(record.data), kinds.of(record.channel_id), raw)
+                _take(record.data, kinds.of(record.channel_id), raw)
             elif isinstance(record, Chunk):
                 try:
                     whole = parts(record)
@@ -438,23 +438,24 @@ class _Kinds:
 
 def _take_chunk(chunk: Chunk, records: list[tuple[int, int, int, int]], kinds: _Kinds, raw: _Raw) -> None:
     """Collect what is in a chunk."""
-    data = memoryview(chunk.data)
     for opcode, _, start, stop in records:
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            content = ReadDataStream(io.BytesIO(data[start:stop]))
+            content = ReadDataStream(io.BytesIO(chunk.data[start:stop]))
             kinds.note(Schema.read(content) if opcode == Opcode.SCHEMA else Channel.read(content))
     ticks = kinds.channels_of(Tick.DESCRIPTOR.full_name)
     message = int(Opcode.MESSAGE)
-    raw.ticks.add([data[a:b] for opcode, channel, a, b in records if opcode == message and channel in ticks])
+    raw.ticks.add(
+        chunk.data, [(a, b) for opcode, channel, a, b in records if opcode == message and channel in ticks]
+    )
     for opcode, channel, start, stop in records:
         if opcode == message and channel not in ticks:
-            _take(data[start:stop], kinds.of(channel), raw)
+            _take(chunk.data[start:stop], kinds.of(channel), raw)
 
 
-def _take(message: memoryview, kind: str, raw: _Raw) -> None:
+def _take(message: bytes, kind: str, raw: _Raw) -> None:
     if kind == Tick.DESCRIPTOR.full_name:
-        raw.ticks.add([message])
+        raw.ticks.add(message, [(0, len(message))])
     elif kind == Event.DESCRIPTOR.full_name:
-        raw.events.append(Event.FromString(bytes(message)))
+        raw.events.append(Event.FromString(message))
     else:
         raw.foreign = True

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
+import mmap
 from collections.abc import Mapping
 
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import DecodeError
 
-from trueflight.models.message_columns import leaves, read_columns
+from trueflight.models.message_columns import Columns, leaves
 from trueflight.models.record_pb2 import Tick
 
-BATCH = 4 << 20
-"""Bytes of messages that are read at once."""
+BATCH = 1 << 19
+"""Bytes of messages that are read at once: so many stay in the processor's cache."""
 VECTORS = (
     "position",
     "velocity",
@@ -47,40 +49,49 @@ class TickColumns:
 
     def __init__(self, size: int = 0) -> None:
         self.count = 0
-        self._waiting: list[memoryview] = []
+        self._waiting: list[bytes] = []
+        self._starts: list[int] = []
+        self._stops: list[int] = []
         self._bytes = self._read = 0
-        self._words = {"": 0}
         self._room = max(ROOM, size // LEAST)
         self._columns, self._into = _empty(self._room)
+        never_told = (*VECTORS, "rotor_speed")
+        unknown = {path: np.nan if path.split(".")[0] in never_told else 0 for path in self._into}
+        self._messages = Columns(Tick, unknown)
 
-    def add(self, ticks: list[memoryview]) -> None:
-        """Take ticks. Raises what protobuf does for one that is damaged, of these or of those not long before; all
-        before that one are kept."""
-        self._waiting += ticks
-        self._bytes += sum(map(len, ticks))
-        self.count += len(ticks)
+    def add(self, data: bytes, spans: list[tuple[int, int]]) -> None:
+        """Take ticks, from a first to before a last byte of `data` each. Raises what protobuf does for one that is
+        damaged, of these or of those not long before; all before that one are kept."""
+        if not spans:
+            return
+        self._waiting.append(data)
+        self._starts += [self._bytes + start for start, _ in spans]
+        self._stops += [self._bytes + stop for _, stop in spans]
+        self._bytes += len(data)
+        self.count += len(spans)
         if self._bytes >= BATCH:
             self.settle()
 
     def settle(self) -> None:
         """Read what is waiting; raises as `add` does."""
-        waiting, self._waiting, self._bytes = self._waiting, [], 0
+        data, starts, stops = b"".join(self._waiting), np.array(self._starts, int), np.array(self._stops, int)
+        self._waiting, self._starts, self._stops, self._bytes = [], [], [], 0
         try:
-            self._take(waiting)
+            self._take(data, starts, stops)
         except Exception:  # noqa: BLE001 - a word that is none, or what protobuf raises
-            whole, error = _until_damaged(waiting)
-            self.count -= len(waiting) - len(whole)
-            self._take(whole)
+            whole, error = _until_damaged(data, starts, stops)
+            self.count -= len(starts) - whole
+            self._take(data, starts[:whole], stops[:whole])
             raise error from None
 
-    def _take(self, ticks: list[memoryview]) -> None:
-        if not ticks:
+    def _take(self, data: bytes, starts: np.ndarray, stops: np.ndarray) -> None:
+        if not len(starts):
             return
-        while self._read + len(ticks) > self._room:
+        while self._read + len(starts) > self._room:
             self._grow()
-        rows = slice(self._read, self._read + len(ticks))
-        _blank(self._columns, rows)
-        read_columns(Tick, ticks, {path: column[rows] for path, column in self._into.items()}, self._words)
+        rows = slice(self._read, self._read + len(starts))
+        into = {path: column[rows] for path, column in self._into.items()}
+        self._messages.read(data, starts, stops - starts, into)
         self._read = rows.stop
 
     def _grow(self) -> None:
@@ -94,28 +105,35 @@ class TickColumns:
         """Columns (N,) or (N, k) of all ticks, by the names of `models.record.FlightRecord`; what no tick has is left
         out."""
         columns = {name: column[: self._read] for name, column in self._columns.items()}
-        words = np.array(list(self._words), object)
+        words = np.array(list(self._messages.words), object)
         for path, field in leaves(Tick.DESCRIPTOR):
             if field.type == FieldDescriptor.TYPE_STRING:
                 columns[path] = words[columns[path]]
         return _known(columns)
 
 
-def _until_damaged(ticks: list[memoryview]) -> tuple[list[memoryview], Exception]:
-    """The ticks before the first that protobuf cannot read, and what it says of that."""
-    for i, tick in enumerate(ticks):
+def _until_damaged(data: bytes, starts: np.ndarray, stops: np.ndarray) -> tuple[int, Exception]:
+    """How many ticks are before the first that protobuf cannot read, and what it says of that."""
+    for i, (start, stop) in enumerate(zip(starts, stops, strict=True)):
         try:
-            Tick.FromString(bytes(tick))
+            Tick.FromString(data[start:stop])
         except DecodeError as error:
-            return ticks[:i], error
+            return i, error
     raise AssertionError("ticks that protobuf reads are not read")
+
+
+def _untouched(*shape: int, kind: type = float) -> np.ndarray:
+    """An array in memory that is taken page by page as it is written to; numpy asks for pages of 2 MB."""
+    size = math.prod(shape) * np.dtype(kind).itemsize
+    room = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    return np.frombuffer(room, kind).reshape(shape)
 
 
 def _empty(count: int) -> tuple[dict[str, np.ndarray], Mapping[str, np.ndarray]]:
     """Columns for so many ticks, and the place in them of every field by its path."""
-    columns: dict[str, np.ndarray] = {name: np.empty((count, 3)) for name in VECTORS}
-    columns |= {"quaternion": np.empty((count, 4)), "rotor_speed": np.empty((count, ROTORS))}
-    columns |= {"feedback_thrust": np.empty(count), "feedback_body_rate": np.empty((count, 3))}
+    columns = {name: _untouched(count, 3) for name in VECTORS}
+    columns |= {"quaternion": _untouched(count, 4), "rotor_speed": _untouched(count, ROTORS)}
+    columns |= {"feedback_thrust": _untouched(count), "feedback_body_rate": _untouched(count, 3)}
     into: dict[str, np.ndarray] = {"feedback.thrust": columns["feedback_thrust"]}
     into |= {f"feedback.body_rate.{c}": columns["feedback_body_rate"][:, i] for i, c in enumerate("xyz")}
     into |= {f"quaternion.{c}": columns["quaternion"][:, i] for i, c in enumerate("wxyz")}
@@ -124,15 +142,8 @@ def _empty(count: int) -> tuple[dict[str, np.ndarray], Mapping[str, np.ndarray]]
         into |= {f"{name}.{c}": columns[name][:, i] for i, c in enumerate("xyz")}
     for path, field in leaves(Tick.DESCRIPTOR):
         if "." not in path and path not in columns:
-            columns[path] = into[path] = np.empty(count, _KINDS[field.type])
+            columns[path] = into[path] = _untouched(count, kind=_KINDS[field.type])
     return columns, into
-
-
-def _blank(columns: dict[str, np.ndarray], rows: slice) -> None:
-    """What a tick says that has no field at all."""
-    for name, column in columns.items():
-        unknown = np.nan if name in VECTORS or name == "rotor_speed" else 0
-        column[rows] = unknown
 
 
 def _known(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -7,11 +7,12 @@ changes within seconds: a battery that empties, a payload or a thrust curve leav
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from trueflight.groundstation.reading.faults import Columns
+from trueflight.groundstation.reading.sliding import moving_mean
 from trueflight.groundstation.reading.uniform import segments, slopes
 from trueflight.models.flight import Check
 from trueflight.models.frames import rotate
@@ -67,26 +68,35 @@ class _Changes:
 
     def __init__(self, t: np.ndarray, flying: np.ndarray) -> None:
         self.t, self.flying = t, flying
-        self.dt = float(np.median(np.diff(t)))
+        self.dt, self.parts = float(np.median(np.diff(t))), segments(t)
         self.seconds = float(np.sum(flying)) * self.dt
 
-    def of(self, column: np.ndarray, late: float = 0.0, fast: float = FAST, slow: float = SLOW) -> np.ndarray:
-        """The changes of a column (N,) or (N, k), read `late` s later, at the rows in the air."""
-        from scipy.ndimage import uniform_filter1d  # dear to load, and not every command reads a flight
+    def of(self, column: np.ndarray, fast: float = FAST, slow: float = SLOW) -> np.ndarray:
+        """The changes of a column (N,) or (N, k) at the rows in the air."""
+        return self.late(column, [0.0], fast, slow)[0]
 
-        shift, width = round(late / self.dt), max(1, round(fast / self.dt))
-        out = np.full(column.shape, np.nan)
-        for part in segments(self.t):
-            some = column[part]
-            if len(some) > 2 * shift + width:
-                smooth = uniform_filter1d(some, width, axis=0)
-                change = smooth - uniform_filter1d(some, max(width, round(slow / self.dt)), axis=0)
-                out[part.start : part.stop - shift] = change[shift:]
-        return out[self.flying]
-
-    def lags(self) -> np.ndarray:
-        """Delays to be tried, s."""
-        return np.arange(0.0, LATEST + 1e-9, max(0.02, self.dt))
+    def late(
+        self,
+        column: np.ndarray,
+        delays: Iterable[float] | None = None,
+        fast: float = FAST,
+        slow: float = SLOW,
+    ) -> list[np.ndarray]:
+        """The changes of a column read with each of the `delays` (s), those to be tried without them, at the rows in
+        the air."""
+        width, wide = (max(1, round(seconds / self.dt)) for seconds in (fast, slow))
+        changes = np.full(column.shape, np.nan)
+        for part in self.parts:
+            smooth = moving_mean(column[part], width)
+            changes[part] = smooth - moving_mean(column[part], max(width, wide))
+        found = []
+        for delay in np.arange(0.0, LATEST + 1e-9, max(0.02, self.dt)) if delays is None else delays:
+            shift, out = round(delay / self.dt), np.full(column.shape, np.nan)
+            for part in self.parts:
+                if part.stop - part.start > 2 * shift + width:
+                    out[part.start : part.stop - shift] = changes[part.start + shift : part.stop]
+            found.append(out[self.flying])
+        return found
 
 
 def _correlation(one: np.ndarray, other: np.ndarray) -> float:
@@ -111,9 +121,9 @@ def _lift(changes: _Changes, columns: Columns, vehicle: Vehicle) -> Iterator[Che
         return
     fast = FAST if "specific_force" in columns else DIFFERENTIATED
     thrust = changes.of(columns["thrust_command"], fast=fast) * GRAVITY / max(vehicle.hover_thrust, 1e-3)
-    felt = [changes.of(force, late, fast) for late in changes.lags()]
+    felt = changes.late(force, fast=fast)
     follows = max(_correlation(thrust, late) for late in felt)
-    turned = max(_correlation(thrust, changes.of(mirrored, late, fast)) for late in changes.lags())
+    turned = max(_correlation(thrust, late) for late in changes.late(mirrored, fast=fast))
     what = "the accelerometer's z" if "specific_force" in columns else "the climb"
     left = 1.0 - follows if follows < 0 else 1.0 - follows**2
     sure = (
@@ -155,9 +165,7 @@ def _motors(changes: _Changes, columns: Columns, _vehicle: Vehicle) -> Iterator[
     if min(np.nanstd(mean), np.nanstd(collective)) < STEERED:
         yield Check(MOTORS, "cannot tell", float("nan"), "the thrust changes too little to compare them")
         return
-    follows = _strongest(
-        [_correlation(collective, changes.of(motors.mean(axis=1), s)) for s in changes.lags()]
-    )
+    follows = _strongest([_correlation(collective, late) for late in changes.late(motors.mean(axis=1))])
     if follows < LITTLE:
         text = (
             f"the motors do not follow the thrust command (correlation {follows:.2f}): two vehicles' columns?"
@@ -178,7 +186,7 @@ def _rotors(changes: _Changes, columns: Columns, _vehicle: Vehicle) -> Iterator[
         yield Check(ROTORS, "cannot tell", float("nan"), "the motors differ too little to compare them")
         return
     apart = speeds - speeds.mean(axis=1, keepdims=True)
-    at = [changes.of(apart, late) for late in changes.lags()]
+    at = changes.late(apart)
     count = motors.shape[1]
     table = np.array(
         [
@@ -219,7 +227,7 @@ def _torque(changes: _Changes, columns: Columns, vehicle: Vehicle) -> Iterator[C
     if still or np.min(np.nanstd(changes.of(turning, slow=1.0), axis=0)) < TURNS:
         yield Check(TORQUE, "cannot tell", float("nan"), "the vehicle turns too little to compare them")
         return
-    at = [changes.of(turning, late, slow=1.0) for late in changes.lags()]
+    at = changes.late(turning, slow=1.0)
 
     def follows(order: tuple[int, ...]) -> float:
         wanted = (

@@ -10,8 +10,8 @@ and what follows a crash.
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
+from trueflight.groundstation.reading.sliding import moving_maximum
 from trueflight.groundstation.reading.uniform import segments
 from trueflight.models.vehicle import Vehicle
 
@@ -91,7 +91,7 @@ def _impacts(
     norm = np.linalg.norm(f, axis=1)
     # What was commanded explains as much force: a racing quadrotor pulls 6 g without hitting anything.
     width = max(1, round(0.3 / float(np.median(np.diff(t)))))
-    commanded = ndimage.maximum_filter1d(vehicle.thrust(columns["thrust_command"]) / vehicle.mass, width)
+    commanded = moving_maximum(vehicle.thrust(columns["thrust_command"]) / vehicle.mass, width)
     limit = np.maximum(max(CRASH, CRASH_RATIO * float(np.median(norm[flying]))), 3.0 * commanded)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flying.astype(np.int8), [0]])))
     for a, b in zip(edges[::2], edges[1::2], strict=True):

@@ -98,7 +98,10 @@ def assemble(
         given["velocity"] = trend(t, given["position"], WIDE) if felt else slopes(t, given["position"])
         said.append("no velocity in the log: differentiated from the position")
     agreed = reconcile(t, given, in_air)
-    checks = (*agreed.checks, *actuation_checks(t[agreed.keep], agreed.columns, in_air[agreed.keep], vehicle))
+    checks = (
+        *agreed.checks,
+        *actuation_checks(_of(t, agreed.keep), agreed.columns, _of(in_air, agreed.keep), vehicle),
+    )
     named = any(c.mapping and c.verdict == "contradicts" for c in checks)
     if wrong := implausible if implausible and not named else refusal(checks):
         raise InputError(f"{origin}: {wrong}")
@@ -106,19 +109,29 @@ def assemble(
     return Flight(
         name=path.stem,
         vehicle=vehicle,
-        t=t[agreed.keep],
+        t=_of(t, agreed.keep),
         **agreed.columns,  # type: ignore[arg-type]
-        flying=in_air[agreed.keep],
+        flying=_of(in_air, agreed.keep),
         accelerometer=accelerometer and "specific_force" in given,
         sensor_rate={**(rates or {}), **agreed.rates}.get(
             "specific_force" if "specific_force" in given else "velocity"
         ),
         origin=origin,
-        data_hash=hashlib.sha256(path.read_bytes()).hexdigest(),
+        data_hash=_hash_of(path),
         notes=(*said, *agreed.notes, *(c.text for c in checks[len(agreed.checks) :] if c.verdict == "weak")),
-        extra={name: column[agreed.keep] for name, column in extras.items()},
+        extra={name: _of(column, agreed.keep) for name, column in extras.items()},
         consistency=checks,
     )
+
+
+def _of(column: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    """The rows of a column to `keep` (N,); not copied where that is all of them: an hour's flight is large."""
+    return column if np.all(keep) else column[keep]
+
+
+def _hash_of(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _whole_rows(
@@ -135,6 +148,8 @@ def _whole_rows(
     wanted = {name: every[name] for name in names}
     _, whole, missing = rows.complete(t, {**wanted, "row": np.arange(len(t))}, sorted_place)
     kept = whole.pop("row")
+    if len(kept) == len(t):
+        return t, every | whole, [*sorted_, *repeated, *missing]
     others = {name: column[kept] for name, column in every.items() if name not in wanted}
     return t[kept], {**whole, **others}, [*sorted_, *repeated, *missing]
 

@@ -77,9 +77,11 @@ def reconcile(t: np.ndarray, columns: Columns, flying: np.ndarray) -> Reconciled
     """
     columns, rates, notes = unheld(t, columns, flying)
     # what jumps must not look like a delay, and what is late must not look like jumps
-    steady = flying & _kept(t, steps(t, columns, flying), flying)
-    columns, late = _undelayed(Windows(t, steady, rates), columns)
     found = steps(t, columns, flying)
+    steady = flying & _kept(t, found, flying)
+    columns, late = _undelayed(Windows(t, steady, rates), columns)
+    if any(c.verdict == "undone" for c in late):
+        found = steps(t, columns, flying)
     heading = [s for s in found if s.what == "heading" and not s.glitch]
     if 0 < len(heading) <= MOST_JUMPS:
         columns, said = _without_heading_jumps(Windows(t, flying, rates), columns, heading)
@@ -90,7 +92,7 @@ def reconcile(t: np.ndarray, columns: Columns, flying: np.ndarray) -> Reconciled
     keep = _kept(t, found, flying)
     if not np.all(keep):
         notes += told(t, found)
-    columns = {name: column[keep] for name, column in columns.items()}
+        columns = {name: column[keep] for name, column in columns.items()}
     checks = _examined(Windows(t[keep], flying[keep], rates), columns, late)
     notes += [c.text for c in checks if c.verdict in ("undone", "weak")]
     if still := [c.pair for c in checks if c.text == TOO_LITTLE]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from trueflight.groundstation.reading.assemble import assemble
 from trueflight.groundstation.reading.clocks import of_one_clock
 from trueflight.groundstation.reading.mapping import Mapping
-from trueflight.groundstation.reading.rows import held
+from trueflight.groundstation.reading.rows import held, whole
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS, Flight
 from trueflight.models.record import FlightRecord, read_record
@@ -52,19 +53,17 @@ def read_flight_record(
         del columns["battery_voltage"]
     for name in ("thrust_command", "body_rate_command"):
         if name in columns:  # no setpoint was sent there: nothing was commanded, nothing is missing
-            columns[name] = np.nan_to_num(columns[name])
+            columns[name] = _zero_where_unknown(columns[name])
     for name in REFERENCES:
         if name in columns:
             columns[name] = held(columns[name])
-    commanded = np.isin(ticks["phase"], COMMANDED) & ticks["armed"] & ticks["setpoint_sent"]
+    commanded = _is(ticks["phase"], COMMANDED.__contains__) & ticks["armed"] & ticks["setpoint_sent"]
     extra = {name: ticks[name] for name in KEPT if name in ticks and not _unknown(ticks[name])}
-    extra["mission"] = (ticks["phase"] == "mission").astype(float)
-    extra["corrected"] = np.array(
-        [not word.startswith(("off", "tripped")) for word in ticks["guard"]], dtype=float
-    )
+    extra["mission"] = _is(ticks["phase"], "mission".__eq__).astype(float)
+    extra["corrected"] = 1.0 - _is(ticks["guard"], lambda word: word.startswith(("off", "tripped")))
     if "shadow_raw" in ticks:
-        extra["shadow"] = (ticks["shadow"] != "").astype(float)
-        extra["shadow_raw"] = np.nan_to_num(ticks["shadow_raw"])
+        extra["shadow"] = _is(ticks["shadow"], bool).astype(float)
+        extra["shadow_raw"] = _zero_where_unknown(ticks["shadow_raw"])
     extra["commanded"] = commanded.astype(float)
     t = ticks["t"]
     if not np.any(commanded):
@@ -73,6 +72,8 @@ def read_flight_record(
             f"{', '.join(sorted(set(ticks['phase'])))}); "
             "take another one (`groundstation flights DIR`)"
         )
+    notes = (*record.notes, *foreign, *_trip(ticks["guard"], t))
+    del record, ticks  # an hour of them is large: what is not looked at must not stay
     return assemble(
         path,
         believed,
@@ -81,7 +82,7 @@ def read_flight_record(
         lambda row: f"{path}, tick {row + 1}",
         extra=extra,
         commanded=commanded,
-        notes=(*record.notes, *foreign, *_trip(ticks["guard"], t)),
+        notes=notes,
         mapping=mapping,
     )
 
@@ -107,7 +108,7 @@ def _of_the_vehicle(path: Path, ticks: dict[str, np.ndarray]) -> tuple[dict[str,
 
 def _trip(guard: np.ndarray, t: np.ndarray) -> list[str]:
     """That the correction was switched off in flight, when and why: whoever reads a figure must know."""
-    tripped = np.flatnonzero([word.startswith("tripped") for word in guard])
+    tripped = np.flatnonzero(_is(guard, lambda word: word.startswith("tripped")))
     return (
         [f"correction switched off at {t[tripped[0]]:.1f} s: guard {guard[tripped[0]]}"]
         if len(tripped)
@@ -126,7 +127,16 @@ def _vehicle(path: Path, record: FlightRecord, vehicle: str | Path | Vehicle | N
     return record.vehicle
 
 
+def _is(words: np.ndarray, wanted: Callable[[str], bool]) -> np.ndarray:
+    """Which of many `words` (N,), few of them different, are `wanted`."""
+    answers = {word: bool(wanted(word)) for word in set(words)}
+    return np.fromiter(map(answers.__getitem__, words), bool, len(words))
+
+
+def _zero_where_unknown(column: np.ndarray) -> np.ndarray:
+    return np.nan_to_num(column) if not np.all(whole(column)) else column
+
+
 def _unknown(column: np.ndarray) -> bool:
     """Whether a column holds nothing, or nothing in most ticks."""
-    finite = np.isfinite(column if column.ndim == 1 else column.sum(axis=1))
-    return bool(finite.mean() < 0.5)
+    return bool(whole(column).mean() < 0.5)

@@ -58,12 +58,12 @@ class Pair:
     def left(self) -> float:
         """Share of the motion's energy by which the two differ, beyond what drag may take; 0 where they agree, 2 where
         they are strangers."""
-        energy = 0.5 * (np.sum(self.one**2) + np.sum(self.other**2))
+        energy = 0.5 * (_squares(self.one) + _squares(self.other))
         differ = self.one - self.other
         if self.beside is not None:
             drag = -np.sum(differ * self.beside, axis=0) / np.maximum(np.sum(self.beside**2, axis=0), 1e-12)
             differ = differ + np.clip(drag, 0.0, MOST_DRAG) * self.beside
-        return float(np.sum(differ**2) / max(energy, 1e-12))
+        return _squares(differ) / max(energy, 1e-12)
 
     def turned_back(self, angle: float) -> Pair:
         """The pair with `one` turned about z by `-angle` rad."""
@@ -103,6 +103,9 @@ class Windows:
         moving = [3.0 / rate for rate in (rates or {}).values()]
         self.turn = max(1, round(max(TURN, *turning, 0.0) / self.dt))
         self.move = max(1, round(max(MOVE, *moving, 0.0) / self.dt))
+        self.parts = segments(t)
+        self._rows: dict[tuple[int, int], np.ndarray] = {}
+        self._means: dict[tuple[str, int, int], tuple[np.ndarray, np.ndarray]] = {}
         no = np.empty(0)
         # attitude and force, and the attitude, with what became of them
         self._turned: tuple[np.ndarray, np.ndarray, np.ndarray] = (no, no, no)
@@ -110,11 +113,13 @@ class Windows:
 
     def rows(self, width: int, reach: int = 0) -> np.ndarray:
         """First rows of windows of `width` samples in the air, with `reach` more on either side, a quarter apart."""
-        starts = [np.arange(s.start + reach, s.stop - width - reach) for s in segments(self.t)]
-        rows = np.concatenate([*starts, np.array([], dtype=int)])
-        ground = np.concatenate([[0], np.cumsum(~self.flying)])
-        rows = rows[ground[rows + width + 1] == ground[rows]]
-        return rows[:: max(1, width // 4)]
+        if (width, reach) not in self._rows:
+            starts = [np.arange(s.start + reach, s.stop - width - reach) for s in self.parts]
+            rows = np.concatenate([*starts, np.array([], dtype=int)])
+            ground = np.concatenate([[0], np.cumsum(~self.flying)])
+            rows = rows[ground[rows + width + 1] == ground[rows]]
+            self._rows[width, reach] = rows[:: max(1, width // 4)].copy()
+        return self._rows[width, reach]
 
     def pairs(self, columns: Columns) -> list[Pair]:
         """The pairs that the columns allow."""
@@ -130,11 +135,12 @@ class Windows:
         rows = self.rows(width, reach)
         one = self._moved(name, columns, rows + shift)
         if name == ROTATION:
-            return self._pair(
-                name, one, self.mean(columns["angular_velocity"], rows, width), rows, width, TURNS
-            )
+            turned = self._mean_of("angular_velocity", columns, rows, width, reach)
+            return self._pair(name, one, turned, rows, width, TURNS)
         if name == MOTION:
-            return self._pair(name, one, self.mean(columns["velocity"], rows, width), rows, width, MOVES)
+            return self._pair(
+                name, one, self._mean_of("velocity", columns, rows, width, reach), rows, width, MOVES
+            )
         if name == FORCE:
             felt = rotate(columns["quaternion"], columns["specific_force"])
             return self._pair(name, one, self._felt(self.mean(felt, rows, width)), rows, width, GAINS)
@@ -186,10 +192,13 @@ class Windows:
         """Mean over each window of each element of the rotation times each axis of the accelerometer, (M, 3, 3, 3)."""
         q, f = columns["quaternion"], columns["specific_force"]
         if self._turned[0] is not q or self._turned[1] is not f:
-            axes = np.stack([rotate(q, np.tile(axis, (len(q), 1))) for axis in np.eye(3)], -1)
-            every = (axes[:, :, :, None] * f[:, None, None, :]).reshape(len(q), 27)
             rows = self.rows(self.move)
-            self._turned = (q, f, self.mean(every, rows, self.move).reshape(len(rows), 3, 3, 3))
+            means = np.empty((len(rows), 3, 3, 3))
+            for j, axis in enumerate(np.eye(3)):
+                turned = rotate(q, np.tile(axis, (len(q), 1)))
+                for k in range(3):
+                    means[:, :, j, k] = self.mean(turned * f[:, k : k + 1], rows, self.move)
+            self._turned = (q, f, means)
         return self._turned[2]
 
     def _felt(self, force: np.ndarray) -> np.ndarray:
@@ -216,17 +225,29 @@ class Windows:
         seconds = len(rows) * max(1, width // 4) * self.dt
         return Pair(name, one, other, seconds, width * self.dt, weak)
 
+    def _mean_of(self, name: str, columns: Columns, rows: np.ndarray, width: int, reach: int) -> np.ndarray:
+        """`mean` of a column by its name over the windows of `rows(width, reach)`; what it was is remembered."""
+        column, mean = self._means.get((name, width, reach), (None, None))
+        if column is not columns[name] or mean is None:
+            mean = self.mean(columns[name], rows, width)
+            self._means[name, width, reach] = (columns[name], mean)
+        return mean
+
     def mean(self, column: np.ndarray, rows: np.ndarray, width: int) -> np.ndarray:
         """Mean of a column (N, k) over windows, (M, k), by trapezes."""
-        halves = 0.5 * (column[1:] + column[:-1])
-        total = np.concatenate([np.zeros((1, column.shape[1])), np.cumsum(halves, axis=0)])
-        return np.asarray((total[rows + width] - total[rows]) / width)
+        out, ends = np.empty((len(rows), column.shape[1])), rows + width
+        for k, axis in enumerate(
+            column.T
+        ):  # one after the other, for the cumulative sums of all take their time
+            total = np.cumsum(axis)
+            out[:, k] = (total[ends] - total[rows] + 0.5 * (axis[rows] - axis[ends])) / width
+        return out
 
     def earlier(self, column: np.ndarray, late: float, unit_quaternion: bool = False) -> np.ndarray:
         """A column (N, k) as it would be without a delay of `late` s, within each stretch of the clock."""
         out = column.copy()
         source = continuous_quaternion(column) if unit_quaternion else column
-        for part in segments(self.t):
+        for part in self.parts:
             clock = self.t[part]
             out[part] = np.stack([np.interp(clock + late, clock, axis) for axis in source[part].T], -1)
         return out / np.linalg.norm(out, axis=1, keepdims=True) if unit_quaternion else out
@@ -243,6 +264,10 @@ def _possible(columns: Columns) -> list[str]:
     if "quaternion" in has and has & {"position", "velocity"}:
         names.append(FORCE if "specific_force" in has else TILT)
     return names
+
+
+def _squares(values: np.ndarray) -> float:
+    return float(np.einsum("ij,ij->", values, values))
 
 
 def _rms(values: np.ndarray) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS
+from trueflight.models.frames import BLOCK
 from trueflight.models.vehicle import GRAVITY, Vehicle
 
 LOWEST_RATE = 10.0  # Hz; below it neither rates nor drag can be told from noise
@@ -202,14 +203,23 @@ def implausible_force(columns: dict[str, np.ndarray], flying: np.ndarray) -> str
 
 def body_rate(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
     """Mean body rates (N, 3) in rad/s that turn attitudes `start` (N, 4) into `end` (N, 4)."""
-    w0, v0 = start[:, :1], -start[:, 1:]
-    w1, v1 = end[:, :1], end[:, 1:]
-    scalar = w0 * w1 - np.sum(v0 * v1, axis=1, keepdims=True)
-    vector = w0 * v1 + w1 * v0 + np.cross(v0, v1)
-    vector = np.sign(np.where(scalar == 0, 1.0, scalar)) * vector
-    sine = np.linalg.norm(vector, axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
-    return np.asarray(vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 2.0) / seconds)
+    out = np.empty((len(start), 3))
+    for first in range(0, len(out), BLOCK):
+        rows = slice(first, first + BLOCK)
+        (w0, x0, y0, z0), (w, x, y, z) = start[rows].T, end[rows].T
+        scalar = w0 * w + x0 * x + y0 * y + z0 * z
+        between = (
+            w0 * x - w * x0 - y0 * z + z0 * y,
+            w0 * y - w * y0 - z0 * x + x0 * z,
+            w0 * z - w * z0 - x0 * y + y0 * x,
+        )
+        sine = np.sqrt(between[0] ** 2 + between[1] ** 2 + between[2] ** 2)
+        angle = 2.0 * np.arctan2(sine, np.abs(scalar))
+        rate = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 2.0) / seconds
+        rate = np.where(scalar < 0, -rate, rate)
+        for k in range(3):
+            out[rows, k] = between[k] * rate
+    return out
 
 
 def _ran_away(

@@ -69,7 +69,7 @@ def complete(
     out = dict(columns)
     bad = np.zeros(len(t), dtype=bool)
     for name, column in columns.items():
-        missing = ~np.isfinite(column if column.ndim == 1 else column.sum(axis=1))
+        missing = ~whole(column)
         if not np.any(missing):
             continue
         if name in HELD and not np.all(missing):
@@ -119,10 +119,15 @@ def _filled(t: np.ndarray, column: np.ndarray, missing: np.ndarray) -> tuple[np.
     return out, missing & ~fill
 
 
+def whole(column: np.ndarray) -> np.ndarray:
+    """In which rows of a column (N,) or (N, k) all numbers are finite, (N,)."""
+    return np.isfinite(column if column.ndim == 1 else sum(column.T))
+
+
 def held(column: np.ndarray) -> np.ndarray:
     """A column (N,) or (N, k) whose missing rows hold the last value (the first one before it)."""
-    known = np.isfinite(column if column.ndim == 1 else column.sum(axis=1))
-    if not np.any(known):
+    known = whole(column)
+    if not np.any(known) or np.all(known):
         return column
     rows = np.maximum.accumulate(np.where(known, np.arange(len(column)), 0))
     first = int(np.argmax(known))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from google.protobuf.message import DecodeError
@@ -53,9 +55,14 @@ def ticks(draw: st.DrawFn) -> bytes:
     return bytes(OTHER_WRITERS[draw(st.sampled_from(sorted(OTHER_WRITERS)))](tick.SerializeToString()))
 
 
+def add(collected: TickColumns, data: list[bytes]) -> None:
+    ends = list(itertools.accumulate(map(len, data), initial=3))  # some bytes before them that are no tick's
+    collected.add(b"..." + b"".join(data), list(itertools.pairwise(ends)))
+
+
 def columns_of(data: list[bytes]) -> dict[str, np.ndarray]:
     collected = TickColumns()
-    collected.add([memoryview(one) for one in data])
+    add(collected, data)
     collected.settle()
     return collected.columns()
 
@@ -91,7 +98,7 @@ def test_columns_are_what_protobuf_reads(data: list[bytes]) -> None:
 def test_ticks_before_a_damaged_one_are_kept(damage: bytes) -> None:
     good = [Tick(vehicle_time_us=i + 1, phase="mission").SerializeToString() for i in range(20)]
     collected = TickColumns()
-    collected.add([memoryview(one) for one in [*good, good[0] + damage, *good]])
+    add(collected, [*good, good[0] + damage, *good])
     with pytest.raises(DecodeError):
         collected.settle()
     assert collected.count == 20
