@@ -3,6 +3,7 @@
 from trueflight.groundstation.views.analysis import write_analysis
 from trueflight.groundstation.views.comparison import write_comparison
 from trueflight.groundstation.views.monitor import monitor
+from trueflight.groundstation.views.narrow import write_narrow
 from trueflight.groundstation.views.side_by_side import write_side_by_side
 from trueflight.groundstation.views.tracking import write_tracking
 from trueflight.groundstation.views.training import write_ablation, write_training
@@ -16,6 +17,7 @@ __all__ = [
     "write_analysis",
     "write_before_after",
     "write_comparison",
+    "write_narrow",
     "write_side_by_side",
     "write_tracking",
     "write_training",

@@ -39,6 +39,28 @@ def comparison_panel(
     markdown: str | None = None,
 ) -> rrb.Container:
     """Measured and predicted acceleration per axis, the residual of each version, and the page of errors."""
+    count = len(comparisons)
+    panels = acceleration_views(stream, comparisons, where, root)
+    errors = [
+        (comparisons[k].label, error_over_time(comparisons[k], SMOOTHING), of_version(k, count))
+        for k in _drawn(comparisons)
+    ]
+    name = f"residual over the whole flight, RMS over {SMOOTHING:g} s, m/s²"
+    residual = error_curves(stream, f"{root}residual", errors, name, () if where is None else where.worst)
+    text(stream, f"{root}errors", _summary(comparisons) if markdown is None else markdown)
+    right = (rrb.TextDocumentView(origin=f"{root}errors", name="errors"), residual)
+    return rrb.Horizontal(
+        rrb.Vertical(*panels),
+        rrb.Vertical(*right, row_shares=[1, 1]),
+        column_shares=[3, 2],
+        name="measured and predicted",
+    )
+
+
+def acceleration_views(
+    stream: rr.RecordingStream, comparisons: Sequence[Comparison], where: WhereItFails | None, root: str = ""
+) -> list[rrb.TimeSeriesView]:
+    """Measured and predicted acceleration, a view for each axis that was measured."""
     flight, count = comparisons[0].flight, len(comparisons)
     start = _window(flight.t, where)
     drawn = _drawn(comparisons)
@@ -66,20 +88,7 @@ def comparison_panel(
                 plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=axis == shown[0]),
             )
         )
-    errors = [
-        (comparisons[k].label, error_over_time(comparisons[k], SMOOTHING), of_version(k, count))
-        for k in drawn
-    ]
-    name = f"residual over the whole flight, RMS over {SMOOTHING:g} s, m/s²"
-    residual = error_curves(stream, f"{root}residual", errors, name, () if where is None else where.worst)
-    text(stream, f"{root}errors", _summary(comparisons) if markdown is None else markdown)
-    right = (rrb.TextDocumentView(origin=f"{root}errors", name="errors"), residual)
-    return rrb.Horizontal(
-        rrb.Vertical(*panels),
-        rrb.Vertical(*right, row_shares=[1, 1]),
-        column_shares=[3, 2],
-        name="measured and predicted",
-    )
+    return panels
 
 
 def _drawn(comparisons: Sequence[Comparison]) -> list[int]:

@@ -150,10 +150,10 @@ def _diagnose(about: Subject, steps: _Steps) -> None:
     where = where_it_fails(results[-1])
     fell = waterfall(flight, held_out, line)
     about.results.mkdir(parents=True, exist_ok=True)
-    from trueflight.groundstation.views import write_comparison
+    from trueflight.groundstation.views import write_narrow
 
-    recording = about.results / f"{about.model}-comparison.rrd"
-    write_comparison(recording, results, where)
+    recording = about.results / f"{about.model}-flight.rrd"
+    write_narrow(recording, results, where)
     table = {
         **comparison_table(results[-1]),
         "versions": [comparison_table(c) for c in results],

@@ -27,9 +27,33 @@ function setTime(seconds) {
   return new Uint8Array(field(6, [...field(2, timeline), ...field(3, time)]));
 }
 
+/** The fields of a protobuf message by their numbers: bytes, or a whole number. */
+function fields(bytes) {
+  const found = {};
+  for (let at = 0; at < bytes.length; ) {
+    const number = () => {
+      let value = 0n;
+      for (let shift = 0n; ; shift += 7n) {
+        const byte = bytes[at++];
+        value |= BigInt(byte & 127) << shift;
+        if (byte < 128) return value;
+      }
+    };
+    const key = Number(number());
+    if ((key & 7) === 0) found[key >> 3] = number();
+    else if ((key & 7) === 2) {
+      const length = Number(number());
+      found[key >> 3] = bytes.subarray(at, at + length);
+      at += length;
+    } else break;
+  }
+  return found;
+}
+
+/** Move the viewer's time there, and tell the page where the viewer says that it is. */
 async function moveTo(seconds) {
-  await handle.viewer_control(setTime(seconds));
-  window.parent.postMessage({ at: seconds }, location.origin);
+  const answer = fields(fields(await handle.viewer_control(setTime(seconds)))[6]);
+  window.parent.postMessage({ at: Number(fields(answer[4])[1] ?? 0n) / 1e9 }, location.origin);
 }
 
 window.showRecording = async (url) => {
