@@ -37,6 +37,7 @@ def open_command(
         "trueflight-workbench"
     ),
     port: Annotated[int, typer.Option(help="0: a free one.", min=0, max=65535)] = 0,
+    most: Annotated[float, typer.Option(help="MB of a dropped file at most.", min=0.001)] = 2048.0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")] = True,
 ) -> None:
     """Open the workbench: compare, see where the model fails, add what is missing, watch the error fall.
@@ -53,7 +54,7 @@ def open_command(
         if browser:
             _show(link)
 
-    serve(Serving(folder, store, _opened(flights or [], vehicle), port), ready)
+    serve(Serving(folder, store, _opened(flights or [], vehicle), port, int(1e6 * most)), ready)
 
 
 def _opened(paths: list[Path], vehicle: Path | None) -> tuple[Source, ...]:

@@ -41,6 +41,7 @@ def serve(serving: Serving, ready: Callable[[str, bool], None]) -> None:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((LOOPBACK, serving.port))
+        listening.listen()  # whoever opens the link at once waits for the first answer
     except OSError as error:
         raise InputError(
             f"port {serving.port}: {error.strerror}; choose another --port, or leave it out"

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from trueflight.groundstation.reading.flight_file import ENDINGS
 from trueflight.models.errors import InputError
 
-MOST_BYTES = 2 * 1024**3
+MOST_BYTES = 2_048_000_000
 """Of one file."""
 MOST_NAME = 120
 SIDECARS = ("vehicle.toml", "mapping.toml")

@@ -20,11 +20,15 @@ function varint(value) {
   }
 }
 
-/** The viewer-control request of Rerun that moves the time cursor: seconds of the flight's own clock. */
+/**
+ * The request of Rerun's viewer control that moves the time cursor to seconds of the flight's own clock, and pauses
+ * there. Its format is that of the release that pyproject.toml pins; a test moves it.
+ */
 function setTime(seconds) {
   const timeline = field(1, [...new TextEncoder().encode(TIMELINE)]);
   const time = [8, ...varint(Math.round(seconds * 1e9))];
-  return new Uint8Array(field(6, [...field(2, timeline), ...field(3, time)]));
+  const paused = [40, 1];
+  return new Uint8Array(field(6, [...field(2, timeline), ...field(3, time), ...paused]));
 }
 
 /** The fields of a protobuf message by their numbers: bytes, or a whole number. */
@@ -50,8 +54,23 @@ function fields(bytes) {
   return found;
 }
 
-/** Move the viewer's time there, and tell the page where the viewer says that it is. */
+let wanted = null;
+
+/** Move the viewer's time there, as soon as it has the recording, and tell the page where it says that it is. */
 async function moveTo(seconds) {
+  wanted = seconds;
+  while (wanted === seconds) {
+    try {
+      await move(seconds);
+      wanted = null;
+    } catch {
+      await new Promise((again) => setTimeout(again, 300));
+    }
+  }
+}
+
+async function move(seconds) {
+  if (handle === null || !channel) throw new Error("not yet");
   const answer = fields(fields(await handle.viewer_control(setTime(seconds)))[6]);
   window.parent.postMessage({ at: Number(fields(answer[4])[1] ?? 0n) / 1e9 }, location.origin);
 }
@@ -64,7 +83,6 @@ window.showRecording = async (url) => {
   channel += 1;
   handle.open_channel(`recording-${channel}`, "trueflight");
   handle.send_rrd_to_channel(`recording-${channel}`, bytes);
-  setTimeout(() => window.parent.postMessage("ready", location.origin), 300);
 };
 
 async function begin() {
@@ -72,16 +90,16 @@ async function begin() {
   await wasm_bindgen("/viewer/re_viewer_bg.wasm");
   handle = new wasm_bindgen.WebHandle({
     url: [], manifest_url: null, render_backend: null, video_decoder: null, hide_welcome_screen: true,
-    enable_history: false, notebook: false, persist: false, theme: "system",
+    enable_history: false, notebook: false, persist: false, theme: "dark", // the recordings are drawn for it,
   });
   await handle.start(canvas);
   state.hidden = true;
+  window.parent.postMessage("ready", location.origin);
   await window.showRecording(document.body.dataset.recording);
 }
 
 window.addEventListener("message", (event) => {
-  if (event.origin !== location.origin || handle === null) return;
-  if (typeof event.data?.seconds === "number") moveTo(event.data.seconds).catch((error) => console.warn(String(error)));
+  if (event.origin === location.origin && typeof event.data?.seconds === "number") void moveTo(event.data.seconds);
 });
 
 begin().catch((error) => {

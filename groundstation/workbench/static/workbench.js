@@ -248,7 +248,7 @@ let pending = null;
 window.addEventListener("message", (event) => {
   if (event.origin !== location.origin || event.source !== frame().contentWindow) return;
   if (event.data === "ready" && pending !== null) frame().contentWindow.postMessage({ seconds: pending }, location.origin);
-  if (event.data?.at !== undefined) byId("viewer").dataset.at = String(event.data.at);
+  if (typeof event.data?.at === "number") byId("viewer").dataset.at = String(event.data.at);
 });
 
 byId("show-viewer").addEventListener("click", () => showViewer(byId("viewer").hidden));
