@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
+import shlex
+import sys
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -37,24 +38,31 @@ def demo_command(
     ),
     real: Annotated[bool, typer.Option("--real/--no-real", help="Also analyse real flights.")] = True,
     viewer: Annotated[
-        bool, typer.Option("--viewer/--no-viewer", help="Open Rerun where there is a display.")
+        bool, typer.Option("--viewer/--no-viewer", help="End with the workbench where there is a display.")
     ] = True,
 ) -> None:
     """The main job end to end on a simulated vehicle with a hidden effect, then on real flights.
 
     Example: groundstation demo --seed 7
     """
-    from trueflight.groundstation.operate.processes import has_display, program
+    from trueflight.groundstation.operate.processes import has_display
     from trueflight.groundstation.study.demonstration import demonstrate
 
     audience = _Terminal()
     outcome = demonstrate(output, QUAD5, seed, hidden or [], audience)
     audience.step("Before and after", str(output))
     _print_outcome(outcome)
-    if viewer and has_display():
-        subprocess.Popen([program("rerun"), *map(str, outcome.recordings)], start_new_session=True)
     if real:
         show_real_flights()
+    survey, task = (output / f"{name}-lqr.mcap" for name in ("excitation", "lemniscate"))
+    again = ["groundstation", "open", survey, "--validate", task, "--store", output / "workbench-models"]
+    console.print(
+        f"do it yourself in the browser: {shlex.join(map(str, again))}", highlight=False, soft_wrap=True
+    )
+    if viewer and has_display() and sys.stdout.isatty():
+        from trueflight.groundstation.commands.open import open_command
+
+        open_command([survey], validate=task, store=output / "workbench-models", folder=output / "workbench")
 
 
 def show_real_flights() -> bool:

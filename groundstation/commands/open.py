@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from trueflight.groundstation.commands.options import DEFAULT_STORE, StoreOption, VehicleOption
+from trueflight.groundstation.commands.options import (
+    DEFAULT_STORE,
+    StoreOption,
+    ValidateOption,
+    VehicleOption,
+)
 from trueflight.models.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,6 +38,7 @@ def open_command(
         ),
     ] = None,
     vehicle: VehicleOption = None,
+    validate: ValidateOption = None,
     store: StoreOption = DEFAULT_STORE,
     folder: Annotated[Path, typer.Option(help="Where what is dropped and made is kept.")] = Path(
         "trueflight-workbench"
@@ -54,7 +61,10 @@ def open_command(
         if browser:
             _show(link)
 
-    serve(Serving(folder, store, _opened(flights or [], vehicle), port, int(1e6 * most)), ready)
+    opened = _opened(flights or [], vehicle)
+    held_out = None if validate is None else _opened([validate], vehicle)[0]
+    with suppress(KeyboardInterrupt):  # how it is ended
+        serve(Serving(folder, store, opened, held_out, port, int(1e6 * most)), ready)
 
 
 def _opened(paths: list[Path], vehicle: Path | None) -> tuple[Source, ...]:

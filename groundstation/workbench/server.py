@@ -47,6 +47,7 @@ class Workbench:
     viewer: WebViewer
     most_bytes: int = uploads.MOST_BYTES
     opened: tuple[Source, ...] = ()
+    held_out: Source | None = None
     _tabs: set[asyncio.Queue[str]] = field(default_factory=set)
     _dropped: dict[str, list[uploads.Dropped]] = field(default_factory=dict)
 
@@ -86,6 +87,8 @@ class Workbench:
         self.session.open(on_the_loop)
         for source in self.opened:
             self.session.add_flight(source)
+        if self.held_out is not None:
+            self.session.add_flight(self.held_out, held_out=True)
         try:
             yield
         finally:

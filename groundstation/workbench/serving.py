@@ -23,11 +23,13 @@ LOOPBACK = "127.0.0.1"
 
 @dataclass(frozen=True)
 class Serving:
-    """What is opened and where: `port` 0 takes a free one; flights in `opened` are read at once."""
+    """What is opened and where: `port` 0 takes a free one; flights in `opened` are read at once, and the one that is
+    `held_out` of every fit."""
 
     folder: Path
     store: Path
     opened: tuple[Source, ...] = ()
+    held_out: Source | None = None
     port: int = 0
     most_bytes: int = MOST_BYTES
 
@@ -49,7 +51,7 @@ def serve(serving: Serving, ready: Callable[[str, bool], None]) -> None:
     port = listening.getsockname()[1]
     bench: Workbench | None = None
     session = Session(serving.folder, serving.store, lambda panels: bench.changed(panels) if bench else None)
-    bench = Workbench(session, Pages(), WebViewer(), serving.most_bytes, serving.opened)
+    bench = Workbench(session, Pages(), WebViewer(), serving.most_bytes, serving.opened, serving.held_out)
 
     def link(token: str) -> str:
         return f"http://{LOOPBACK}:{port}/?token={token}"

@@ -102,6 +102,7 @@ class Session:
         self._changed = changed
         self._worker: Worker | None = None
         self._numbers = 0
+        self._to_hold_out = 0
 
     def open(self, hand_over: Callable[[Callable[[], None]], None]) -> None:
         """Start the worker; `hand_over` runs a function on the thread of the server."""
@@ -118,11 +119,13 @@ class Session:
 
     # --- what is asked ------------------------------------------------------------------------------------------
 
-    def add_flight(self, source: Source) -> int:
-        """A flight comes; it is read as soon as the worker is free. Its number."""
+    def add_flight(self, source: Source, held_out: bool = False) -> int:
+        """A flight comes, `held_out` of every fit or not; it is read as soon as the worker is free. Its number."""
         self._numbers += 1
         number = self._numbers
         entry = Entry(number, source)
+        if held_out:
+            self._to_hold_out = number
         self._set(("flights",), entries=(*self.state.entries, entry), waiting=(*self.state.waiting, number))
         self._next()
         return number
@@ -262,8 +265,10 @@ class Session:
             if entry.form is None:
                 entry = replace(entry, form=form_of(part.more["vehicle"]))
         self._replace(entry, ("flights", "vehicle"))
-        if entry.ready and not self.state.fitted:
-            self._fit_to(entry)
+        if entry.ready and number == self._to_hold_out:
+            self._set(PANELS, held_out=number)
+        elif entry.ready and not self.state.fitted:
+            self._fit_to(entry, self.state.held_out)
 
     # --- one after the other --------------------------------------------------------------------------------------
 
