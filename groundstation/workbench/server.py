@@ -82,7 +82,8 @@ class Workbench:
         loop = asyncio.get_running_loop()
 
         def on_the_loop(call: Callable[[], None]) -> None:
-            loop.call_soon_threadsafe(call)
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(call)
 
         self.session.open(on_the_loop)
         for source in self.opened:

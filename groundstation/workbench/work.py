@@ -90,7 +90,7 @@ def do(task: Task, tell: Tell) -> None:
             case Plan():
                 _plan(task, steps)
     except InputError as error:
-        tell(Ended(plain_line(str(error))))
+        tell(Ended(_named(plain_line(str(error)), task)))
     except OSError as error:
         tell(
             Ended(
@@ -107,6 +107,18 @@ def do(task: Task, tell: Tell) -> None:
         )
     else:
         tell(Ended())
+
+
+def _named(problem: str, task: Task) -> str:
+    """A problem with the names that people gave their files, not ours."""
+    flights = (
+        task.flights
+        if isinstance(task, Beside)
+        else (task.flight if isinstance(task, Read) else task.about.flight,)
+    )
+    for flight in flights:
+        problem = problem.replace(str(flight.path), flight.name)
+    return problem
 
 
 def _read(task: Read, steps: _Steps) -> None:

@@ -141,7 +141,7 @@ def test_a_bad_file_is_one_line_in_the_words_of_the_terminal(browser: Browser, t
     words = said.stderr.removeprefix(f"error: {cut}").strip()
     with opened(browser, tmp_path, "--folder", "bench") as page:
         drop(page, cut, VEHICLE)
-        expect(page.locator("#flights .problem").first).to_contain_text(words)
+        expect(page.locator("#flights tr .problem")).to_have_text(f"cut.ulg{words}")
         drop(page, evil)
         expect(page.locator("#drop-problem")).to_contain_text("is no kind of flight file")
         drop(page, VEHICLE)
