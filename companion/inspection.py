@@ -37,7 +37,7 @@ _ANSWER_LIMIT = 1 << 20
 class Finding:
     """What the check of one file found; `info` only where it was accepted, `median` and `worst` s an inference.
 
-    `open` tells which of the fences around the check this machine's kernel does not offer.
+    `straight` where its straight line gives what ONNX Runtime does, so that it flies without that. `open` tells which of the fences around the check this machine's kernel does not offer.
     """
 
     accepted: bool
@@ -46,6 +46,7 @@ class Finding:
     median: float = 0.0
     worst: float = 0.0
     open: tuple[str, ...] = ()
+    straight: bool = False
 
 
 def inspect(files: Sequence[bytes], vehicle: Vehicle, deadline: float) -> list[Finding]:
@@ -105,6 +106,7 @@ def _finding(answer: dict[str, Any]) -> Finding:
         float(answer["median"]),
         float(answer["worst"]),
         tuple(str(one) for one in answer["open"]),
+        bool(answer["straight"]),
     )
 
 
@@ -139,7 +141,8 @@ def _main() -> None:
 
 
 def _refusal(reason: str) -> dict[str, Any]:
-    return {"accepted": False, "reason": reason, "median": 0.0, "worst": 0.0, "info": None}
+    nothing = {"median": 0.0, "worst": 0.0, "straight": False, "info": None}
+    return {"accepted": False, "reason": reason, **nothing}
 
 
 def _answer(verdict: Verdict) -> dict[str, Any]:
@@ -152,6 +155,7 @@ def _answer(verdict: Verdict) -> dict[str, Any]:
         "reason": verdict.reason,
         "median": verdict.median,
         "worst": verdict.worst,
+        "straight": verdict.model.straight,
         "info": {
             "hash": info.hash,
             "name": info.name,

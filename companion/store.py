@@ -125,7 +125,7 @@ class ModelStore:
                 if reason:
                     raise InputError(f"model {name}: {reason}")
                 try:
-                    stored.model = open_model(path.read_bytes(), stored.info)
+                    stored.model = open_model(path.read_bytes(), stored.info, stored.finding.straight)
                 except OSError as error:
                     raise InputError(f"model {name}: cannot read it ({error.strerror})") from None
             return stored.model

@@ -9,17 +9,20 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import onnxruntime
 
 from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
-from trueflight.companion.law.onnx_structure import why_not_self_contained
+from trueflight.companion.law.onnx_structure import decoded, why_not_self_contained
+from trueflight.companion.law.straight_line import NoStraightLine, StraightLine
 from trueflight.companion.law.watch import GuardLimits, Range, Watch
 from trueflight.models import contract
 from trueflight.models.errors import InputError, shown
 from trueflight.models.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 MAX_BYTES = 4 << 20
 """The networks meant here have tens of kilobytes; anything near this is not one of them."""
@@ -28,6 +31,12 @@ LOOK_ROWS = 3
 """Rows of features that a control tick asks for."""
 _TIMING_LIMIT = 0.5  # s; a model that is that slow needs no exact figure
 _RANGE_SAMPLES = 64
+SAME = 1e-4
+"""m/s²: how far a straight line may be from the runtime's answer, whose numbers have 32 bits; a tenth of what golden
+vectors may differ by."""
+_BEYOND = 0.25
+"""Shares of the training range by which it is left on either side where the two are compared: as far as a watch lets a
+model act."""
 
 
 @dataclass(frozen=True)
@@ -52,38 +61,47 @@ class Model:
     """An accepted model: call it with the features (list of F floats) for three accelerations (m/s², heading
     frame).
 
-    One ONNX Runtime thread, input and output bound to buffers once; not to be called from two threads at a
-    time.
+    It computes by a straight line where that was shown to be what the runtime computes, otherwise by the runtime: one
+    thread, input and output bound to buffers once. Not to be called from two threads at a time.
     """
 
-    def __init__(self, session: onnxruntime.InferenceSession, info: ModelInfo) -> None:
+    def __init__(self, computes: StraightLine | Runtime, info: ModelInfo) -> None:
         self.info = info
-        self._session = session
-        self._bound = {1: self._bind(1)}
-        if session.get_inputs()[0].shape[0] != 1:
-            self._bound[LOOK_ROWS] = self._bind(LOOK_ROWS)
+        self.straight = isinstance(computes, StraightLine)
+        self.rows = computes
+        """Error acceleration for each row of features, m/s², heading frame."""
 
-    def __call__(self, features: Sequence[float]) -> list[float]:
+    def __call__(self, features: Sequence[float]) -> Sequence[float]:
         """Error acceleration in m/s², heading frame."""
         return self.rows((features,))[0]
-
-    def rows(self, rows: Sequence[Sequence[float]]) -> list[list[float]]:
-        """Error acceleration for each row of features, m/s², heading frame; three in one run where the file can."""
-        if len(rows) not in self._bound:
-            return [self(features) for features in rows]
-        given, answer, binding = self._bound[len(rows)]
-        given[:] = rows
-        self._session.run_with_iobinding(binding)
-        found: list[list[float]] = answer.tolist()
-        return found
 
     def watched(self, limits: GuardLimits | None = None) -> Watch:
         """A watch over this model, for one flight."""
         info = self.info
         return Watch(self, info.features, limits, info.wants_yaw, info.hash, actuation=info.actuation)
 
+
+class Runtime:
+    """A file as ONNX Runtime computes it: three rows in one run where the file can."""
+
+    def __init__(self, session: onnxruntime.InferenceSession, width: int) -> None:
+        self._session, self._width = session, width
+        self._bound = {1: self._bind(1)}
+        if session.get_inputs()[0].shape[0] != 1:
+            self._bound[LOOK_ROWS] = self._bind(LOOK_ROWS)
+
+    def __call__(self, rows: Sequence[Sequence[float]]) -> list[Sequence[float]]:
+        """Error acceleration for each row of features, m/s², heading frame."""
+        if len(rows) not in self._bound:
+            return [self((features,))[0] for features in rows]
+        given, answer, binding = self._bound[len(rows)]
+        given[:] = rows
+        self._session.run_with_iobinding(binding)
+        found: list[Sequence[float]] = answer.tolist()
+        return found
+
     def _bind(self, rows: int) -> tuple[np.ndarray, np.ndarray, onnxruntime.IOBinding]:
-        given = np.zeros((rows, len(self.info.features)), dtype=np.float32)
+        given = np.zeros((rows, self._width), dtype=np.float32)
         answer = np.zeros((rows, 3), dtype=np.float32)
         binding = self._session.io_binding()
         binding.bind_input(contract.INPUT_NAME, "cpu", 0, np.float32, given.shape, given.ctypes.data)
@@ -131,12 +149,22 @@ def warm_up() -> None:
         _open(b"")
 
 
-def open_model(onnx: bytes, info: ModelInfo) -> Model:
-    """Open a file that was checked before, elsewhere. Raises `InputError` where it does not open here."""
+def open_model(onnx: bytes, info: ModelInfo, straight: bool = False) -> Model:
+    """Open a file that was checked before, elsewhere; `straight` where its straight line was found to be the same there.
+
+    The golden vectors must come out here too, otherwise the runtime is loaded for it. Raises `InputError` where it does
+    not open.
+    """
     if contract.model_hash(onnx) != info.hash:
         raise InputError(f"model {info.hash}: the file on board is another one; deploy it again")
     try:
-        return Model(_open(onnx), info)
+        if straight:
+            with contextlib.suppress(NoStraightLine, _Refused):
+                model = Model(StraightLine(onnx, len(info.features)), info)
+                meta = {bytes(e.key).decode(): bytes(e.value).decode() for e in decoded(onnx).metadata_props}
+                _check_golden(model, meta)
+                return model
+        return Model(Runtime(_open(onnx), len(info.features)), info)
     except _Refused as refusal:
         raise InputError(f"model {info.hash}: {refusal}") from None
 
@@ -172,9 +200,10 @@ def _check(onnx: bytes, vehicle: Vehicle, deadline: float) -> Verdict:
         _word(meta, contract.KEY_DATA_HASH),
         _actuation(meta),
     )
-    model = Model(session, info)
+    model = Model(Runtime(session, len(ranges)), info)
     _check_golden(model, meta)
     _check_range(model)
+    model = _straightened(onnx, model)
     median, worst = _time(model)
     if not median <= 0.5 * deadline:
         raise _Refused(
@@ -184,7 +213,28 @@ def _check(onnx: bytes, vehicle: Vehicle, deadline: float) -> Verdict:
     return Verdict(True, text, model, median, worst)
 
 
+def _straightened(onnx: bytes, reference: Model) -> Model:
+    """The model by its straight line, where that gives what the runtime does: at the golden vectors, in the training
+    range and around it.
+    """
+    try:
+        model = Model(StraightLine(onnx, len(reference.info.features)), reference.info)
+    except NoStraightLine:
+        return reference
+    meta = {bytes(entry.key): bytes(entry.value) for entry in decoded(onnx).metadata_props}
+    golden = json.loads(meta[contract.KEY_GOLDEN_FEATURES.encode()])
+    for point in [*golden, *_points(reference.info, _BEYOND).tolist()]:
+        ours, theirs = model(point), _run(reference, point)
+        for a, b in zip(ours, theirs, strict=True):
+            same = abs(a - b) <= SAME if math.isfinite(b) else not math.isfinite(a)
+            if not same:
+                return reference
+    return model
+
+
 def _open(onnx: bytes) -> onnxruntime.InferenceSession:
+    import onnxruntime  # late: a companion whose models have straight lines never needs it
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
@@ -295,7 +345,7 @@ def _check_ports(session: onnxruntime.InferenceSession, features: int) -> None:
             raise _Refused(f"'{name}' is {ports[0].type} {shape}; expected tensor(float) [N, {width}]")
 
 
-def _run(model: Model, features: Sequence[float]) -> list[float]:
+def _run(model: Model, features: Sequence[float]) -> Sequence[float]:
     try:
         return model(features)
     except Exception as error:  # noqa: BLE001 - a graph may fail in as many ways as it has operators
@@ -332,13 +382,18 @@ def _check_golden(model: Model, meta: dict[str, str]) -> None:
 
 def _check_range(model: Model) -> None:
     """Finite at random points of the training range and at its corners."""
-    low = np.array([one.low for one in model.info.features])
-    high = np.array([one.high for one in model.info.features])
-    points = np.random.default_rng(0).uniform(size=(_RANGE_SAMPLES, len(low)))
-    points[0], points[1] = 0.0, 1.0
-    for point in low + points * (high - low):
+    for point in _points(model.info):
         if not np.all(np.isfinite(_run(model, point.tolist()))):
             raise _Refused("it returns numbers that are not finite inside its own training range")
+
+
+def _points(info: ModelInfo, beyond: float = 0.0) -> np.ndarray:
+    """Random points (N, F) of the training range and its corners; `beyond` shares of it are added on either side."""
+    low = np.array([one.low for one in info.features])
+    width = np.array([one.high for one in info.features]) - low
+    points = np.random.default_rng(0).uniform(size=(_RANGE_SAMPLES, len(low)))
+    points[0], points[1] = 0.0, 1.0
+    return low + ((1.0 + 2.0 * beyond) * points - beyond) * width
 
 
 def _time(model: Model) -> tuple[float, float]:
