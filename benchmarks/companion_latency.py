@@ -11,9 +11,9 @@ by the models of `correction_models.py` (`effects`, `network`, `both`). All ask 
 and for all of them the autopilot is armed, in Offboard and flies its physics by what it is sent: the constant answer
 is that of a hover. Programs take turns, `--rounds` times, because others on the machine disturb them; latencies of all
 rounds are pooled. With `--loads` of more than 0 so many busy programs run beside them. A setpoint counts as lost when
-none came within 50 ms, or when a later odometry message was answered first: the companion's setpoints tell by their time
-which one they answer, those of the bare programs are taken in their order. `cpu` is the processor time of the program
-while it is measured, as a share of one core. `--raw` keeps every latency.
+none came within 50 ms, or when a later odometry message was answered first: the companion's setpoints tell by their
+time which one they answer, those of the bare programs are taken in their order. `cpu` is the processor time of the
+program while it is measured, as a share of one core. `--raw` keeps every latency.
 """
 
 from __future__ import annotations
@@ -289,7 +289,8 @@ def compared(rate: float, load: int, programs: list[str], a: argparse.Namespace)
 def told(row: dict[str, Any]) -> str:
     """A row in words."""
     return (
-        f"{row['rate']:4.0f} Hz  load {row['load']}  {row['program']:9s}  sent {row['sent']:6d}  lost {row['lost']:3d}  "
+        f"{row['rate']:4.0f} Hz  load {row['load']}  {row['program']:9s}  "
+        f"sent {row['sent']:6d}  lost {row['lost']:3d}  "
         f"median {row['median_ms']:.3f} ms ({row['median_ratio']:.2f}x)  p99 {row['p99_ms']:6.3f} ms "
         f"({row['p99_ratio']:.2f}x)  p99.9 {row['p999_ms']:6.2f} ms ({row['p999_ratio']:.2f}x)  "
         f"max {row['max_ms']:6.2f} ms  cpu {100 * row['cpu']:3.0f} %  resident {row['resident_mb']:.0f} MB"

@@ -1,4 +1,4 @@
-"""Where the processor time of one control tick goes, without wire and waiting: the same on a busy machine as on a quiet one.
+"""Where the processor time of one control tick goes, without wire and waiting.
 
     python benchmarks/companion_tick.py [--models FOLDER] [--ticks 4000] [--rounds 5] [--json]
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def _network(flight: Flight) -> Network:
             (draw.normal(size=(b, a)) / a**0.5).astype(np.float32),
             (0.1 * draw.normal(size=b)).astype(np.float32),
         )
-        for a, b in zip(sizes, sizes[1:], strict=False)
+        for a, b in pairwise(sizes)
     )
     scale = np.full(3, 0.2, dtype=np.float32)
     return Network(names, 0.5 * (low + high), 0.5 * (high - low), layers, scale, low, high, flight.data_hash)

@@ -76,11 +76,10 @@ class _Window:
     def add(self, row: tuple[float, ...]) -> list[float]:
         rows, sums = self._rows, self.sums
         rows.append(row)
-        for i, value in enumerate(row):
-            sums[i] += value
+        sums = [a + b for a, b in zip(sums, row, strict=True)]
         while sums[0] > self._seconds and len(rows) > 1:
-            for i, value in enumerate(rows.popleft()):
-                sums[i] -= value
+            sums = [a - b for a, b in zip(sums, rows.popleft(), strict=True)]
+        self.sums = sums
         return sums
 
 
@@ -128,13 +127,17 @@ class Agreement:
         dt: float,
     ) -> str:
         # An estimate in use changes with every sample of the gyroscope and the accelerometer, at rest as well.
-        same = [
-            name
-            for name in ("position", "velocity", "quaternion")
-            if getattr(odometry, name) == getattr(last, name)
-        ]
-        self._still = self._still + dt if same else 0.0
+        if (
+            odometry.position == last.position
+            or odometry.velocity == last.velocity
+            or odometry.quaternion == last.quaternion
+        ):
+            self._still += dt
+        else:
+            self._still = 0.0
         if self._still > self.limits.frozen:
+            names = ("position", "velocity", "quaternion")
+            same = [name for name in names if getattr(odometry, name) == getattr(last, name)]
             return f"the odometry's {' and '.join(same)} did not change for {self._still:.2f} s"
         if imu is None or last_imu is None:
             return ""
@@ -163,14 +166,29 @@ class Agreement:
         share = min(dt / _SMOOTHING, 1.0)
         (x, y), (_, now_x, now_y) = self._drift, tilt
         self._drift = x + share * (now_x - x), y + share * (now_y - y)
+        _, a, b, c, d, e, f, g, h, i = sums
         found = Difference(
-            math.hypot(*sums[1:4]), math.hypot(*sums[4:7]), math.hypot(*sums[7:10]), math.hypot(*self._drift)
+            math.hypot(a, b, c), math.hypot(d, e, f), math.hypot(g, h, i), math.hypot(*self._drift)
         )
-        self.greatest = Difference(*(max(pair) for pair in zip(self.greatest, found, strict=True)))
+        turn, velocity, position, drift = self.greatest
+        self.greatest = Difference(
+            max(turn, found.turn),
+            max(velocity, found.velocity),
+            max(position, found.position),
+            max(drift, found.drift),
+        )
         return self._told(found)
 
     def _told(self, found: Difference) -> str:
-        limits, over = self.limits, f"within {self._short.sums[0]:.1f} s"
+        limits = self.limits
+        if (
+            found.turn <= limits.turn
+            and found.velocity <= limits.velocity
+            and found.position <= limits.position
+            and found.drift <= limits.drift
+        ):
+            return ""
+        over = f"within {self._short.sums[0]:.1f} s"
         if found.turn > limits.turn:
             return f"the odometry turned {math.degrees(found.turn):.0f} degrees otherwise than the gyroscope {over}"
         if found.velocity > limits.velocity:

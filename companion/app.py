@@ -12,6 +12,7 @@ from typing import Any
 import zenoh
 
 from trueflight.companion.batteries import Batteries
+from trueflight.companion.bookkeeping import Bookkeeping
 from trueflight.companion.deployment import Deployment
 from trueflight.companion.director import Director
 from trueflight.companion.flight import FlightStateMachine
@@ -26,7 +27,6 @@ from trueflight.companion.settings import Settings
 from trueflight.companion.signature import Signatures
 from trueflight.companion.store import ModelStore
 from trueflight.companion.telemetry import ATTACHED, Handler, Telemetry, make_event
-from trueflight.companion.tick import make_tick
 from trueflight.companion.vehicle_link import VehicleLink
 from trueflight.companion.watchdog import Watchdog, raise_priority
 from trueflight.companion.zenoh_session import INSECURE, open_planned, plan_session
@@ -112,7 +112,10 @@ class Companion:
         """What flies missions and brings models into flights."""
         link, flight, vehicle = self.link, self.flight, self.vehicle
         safety, rate, folder = settings.safety, settings.rate, Path(settings.records)
-        self.records = Records(folder, vehicle, design, rate, settings.require_record, self.emit)
+        self.books = Bookkeeping(self._write_tick, lambda text: self.emit("warning", "ticks_dropped", text))
+        self.records = Records(
+            folder, vehicle, design, rate, settings.require_record, self.emit, self.books.flush
+        )
         self.readiness = Readiness(link, flight, self.records, safety, vehicle, rate)
         self.deployment = Deployment(store, flight, settings.guard, settings.shadow, self.emit)
         self.director = Director(
@@ -172,6 +175,7 @@ class Companion:
         if self.pose is not None:
             self.pose.close()
         self.link.close()
+        self.books.close()
         self.telemetry.close()
 
     def emit(self, level: str, kind: str, text: str) -> None:
@@ -195,10 +199,13 @@ class Companion:
             outcome.age = odometry.age + latency
         self.flight.watch(latest)
         self._vehicle_time_us = odometry.vehicle_time_us
-        data = make_tick(odometry, latest, outcome, latency).SerializeToString()
-        self.records.tick(data, odometry.vehicle_time_us, odometry.host_time_ns)
-        self.telemetry.tick(data)
+        self.books.note(odometry, latest, outcome, latency)
         self.watchdog.tick()
+
+    def _write_tick(self, data: bytes, vehicle_time_us: int, host_time_ns: int) -> None:
+        """The record first: it must not wait for the network."""
+        self.records.tick(data, vehicle_time_us, host_time_ns)
+        self.telemetry.tick(data)
 
     def _raise_priority(self) -> None:
         """Once, by the control thread itself, which is MAVSDK's."""

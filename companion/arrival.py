@@ -57,6 +57,9 @@ class VehicleClock:
         self._asked: deque[int] = deque(maxlen=_ASKED)
         self._answers: deque[tuple[int, int]] = deque(maxlen=_ANSWERS)
         self._rate = 1.0
+        self._newest: tuple[tuple[int, int], ...] = ()
+        self._least = 0
+        """ns: the least bound of the newest answers, as the vehicle's clock less ours, for clocks that run alike."""
 
     def due(self, host_ns: int) -> bool:
         """Whether it is time to ask again."""
@@ -76,13 +79,16 @@ class VehicleClock:
         (first, begin), (last, end) = self._answers[0], self._answers[-1]
         rate = (end - begin) / (last - first) if last - first > 0.5e9 else 1.0
         self._rate = 1.0 if abs(rate - 1.0) < _SAME_RATE else rate
+        self._newest = tuple(self._answers)[-_RECENT:]
+        self._least = min(vehicle - asked for asked, vehicle in self._newest)
 
     def now(self, host_ns: int) -> int | None:
         """The vehicle's clock at `host_ns`; None where it has not been told lately."""
         if not self._answers or host_ns - self._answers[-1][0] > _SILENT * 1e9:
             return None
-        recent = list(self._answers)[-_RECENT:]
-        return min(vehicle + round(self._rate * (host_ns - asked)) for asked, vehicle in recent)
+        if self._rate == 1.0:
+            return host_ns + self._least
+        return min(vehicle + round(self._rate * (host_ns - asked)) for asked, vehicle in self._newest)
 
 
 class Arrivals:

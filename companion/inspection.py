@@ -37,7 +37,8 @@ _ANSWER_LIMIT = 1 << 20
 class Finding:
     """What the check of one file found; `info` only where it was accepted, `median` and `worst` s an inference.
 
-    `straight` where its straight line gives what ONNX Runtime does, so that it flies without that. `open` tells which of the fences around the check this machine's kernel does not offer.
+    `straight` where its straight line gives what ONNX Runtime does, so that it flies without that. `open` tells which
+    of the fences around the check this machine's kernel does not offer.
     """
 
     accepted: bool

@@ -26,7 +26,8 @@ class Records:
     """The folder of the flight records of a vehicle and its design; one is written at a time.
 
     `emit(level, kind, text)` must not block. `rate` is the ticks a second. `required`: whether a flight may only begin
-    with a record. A flight under way is never ended by its record: what is lost is told at once.
+    with a record. A flight under way is never ended by its record: what is lost is told at once. `flush` hands over the
+    ticks that wait to be written.
     """
 
     def __init__(
@@ -37,10 +38,12 @@ class Records:
         rate: float,
         required: bool,
         emit: Callable[[str, str, str], None],
+        flush: Callable[[], None] = lambda: None,
     ) -> None:
         self._vehicle, self._design = vehicle, design
         self.folder, self.recorder = folder, None
         self._rate, self._required, self._emit = rate, required, emit
+        self._flush = flush
         self._told = ""
         self._rescued = False
 
@@ -72,6 +75,7 @@ class Records:
             **{f"parameter.{key}": str(value) for key, value in mission.trajectory.parameters.items()},
         }
         self._told, self._rescued = "", False
+        self._flush()  # what was before this flight is not of it
         try:
             self.recorder = FlightRecorder(self.folder / name, self._vehicle, self._design, metadata)
             return name, ""
@@ -96,6 +100,7 @@ class Records:
         recorder = self.recorder
         if recorder is None:
             return ""
+        self._flush()
         recorder.close()
         self.look()
         self.recorder = None

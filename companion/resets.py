@@ -61,12 +61,9 @@ def found_reset(
     if not told and not 0.0 < interval < _BETWEEN:
         return None
     half = 0.5 * max(interval, 0.0)
-    x, y, z = (
-        now - then - half * (v + w)
-        for now, then, v, w in zip(
-            odometry.position, previous.position, odometry.velocity, previous.velocity, strict=True
-        )
-    )
+    (x, y, z), (u, v, w) = odometry.position, odometry.velocity
+    (x0, y0, z0), (u0, v0, w0) = previous.position, previous.velocity
+    x, y, z = x - x0 - half * (u + u0), y - y0 - half * (v + v0), z - z0 - half * (w + w0)
     if told:
         return Reset((x, y, z), _turned(odometry, previous, interval), True)
     if x * x + y * y + z * z > jump * jump:

@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from trueflight.companion.latest import Latest
 from trueflight.companion.odometry import Odometry
 from trueflight.companion.outcome import Outcome
 from trueflight.models.record_pb2 import Tick
 
 
-def make_tick(odometry: Odometry, latest: Latest, outcome: Outcome, latency: float) -> Tick:
+class Known(NamedTuple):
+    """What `Latest` said at a tick, where a tick tells of it."""
+
+    battery_voltage: float
+    rotor_speed: tuple[float, ...]
+    flight_mode: str
+    armed: bool
+    specific_force: tuple[float, float, float] | None
+
+
+def known_now(latest: Latest) -> Known:
+    """What is known at this moment."""
+    return Known(
+        latest.battery_voltage, latest.rotor_speed, latest.flight_mode, latest.armed, latest.specific_force
+    )
+
+
+def make_tick(odometry: Odometry, latest: Known, outcome: Outcome, latency: float) -> Tick:
     """The protobuf tick; positions in the home frame, `latency` in s from odometry to the setpoint handed
     over.
     """

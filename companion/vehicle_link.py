@@ -12,6 +12,7 @@ it is the control thread.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import time
 from collections.abc import Callable
@@ -92,6 +93,7 @@ class VehicleLink:
         self.latest.batteries = batteries or Batteries()
         self.others = Others()
         self._overtaken = 0
+        self._kept = False
         self._shares_clock = False
         self._closing = False
         checked_address(address)
@@ -292,6 +294,8 @@ class VehicleLink:
     def _safe(self, handler: Callable[[Fields], None]) -> Callable[[MavlinkMessage, Any], None]:
         def callback(message: MavlinkMessage, _: Any) -> None:
             arrived = time.monotonic_ns()
+            if not self._kept:
+                self._keep_thread()
             if not self._is_autopilot(message):
                 self.others.count(message.system_id, message.component_id)
                 return
@@ -307,6 +311,11 @@ class VehicleLink:
                     raise
 
         return callback
+
+    def _keep_thread(self) -> None:
+        """Let Python keep what it has of MAVSDK's thread, which it would make and forget again with every callback."""
+        self._kept = True
+        ctypes.pythonapi.PyGILState_Ensure()  # never given back: the thread lives as long as we do
 
     def _is_autopilot(self, message: MavlinkMessage) -> bool:
         """Cameras, gimbals, smart batteries and other vehicles may speak on the same link: none of them decides."""

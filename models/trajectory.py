@@ -109,8 +109,11 @@ class Curve:
     def evaluate(self, t: Any, xp: Any) -> tuple[tuple[Any, Any, Any], ...]:
         """Value, first and second derivative of each of the four channels at `t` (float or array)."""
         s, rate, change = self._phase(t) if xp is math else self._phases(t)
-        out = []
+        out: list[tuple[Any, Any, Any]] = []
         for w in self.waves:
+            if xp is math and w.amplitude == 0.0 and w.growth == 0.0:
+                out.append((w.offset + w.slope * s, w.slope * rate, w.slope * change))
+                continue
             angle = w.frequency * s + w.phase
             sin, cos = xp.sin(angle), xp.cos(angle)
             size = w.amplitude + w.growth * s

@@ -13,7 +13,6 @@ from trueflight.models.trajectory import ReferenceSample
 from trueflight.models.vehicle import GRAVITY
 
 Vector = tuple[float, float, float]
-_States = tuple[float, ...]
 
 _LONGEST_GAP = 0.1
 """s; longer steps are cut, so that a gap in the odometry cannot make the integration unstable."""
@@ -25,41 +24,34 @@ class LinearBehaviour:
     def __init__(
         self, design: Design, position: Vector, velocity: Vector, zeta: Vector, reference: ReferenceSample
     ) -> None:
+        self.position, self.velocity = position, velocity
+        self._zeta = zeta
         self._k_eta, self._k_zeta, self._mass = design.K_eta, design.K_zeta, design.mass
-        self._states: _States = (*position, *velocity, *zeta)
         self._reference = reference
-
-    @property
-    def position(self) -> Vector:
-        """Expected position, m, world."""
-        x, y, z = self._states[:3]
-        return x, y, z
-
-    @property
-    def velocity(self) -> Vector:
-        """Expected velocity, m/s, world."""
-        x, y, z = self._states[3:6]
-        return x, y, z
 
     def step(self, reference: ReferenceSample, dt: float) -> None:
         """Go on by `dt` s to the time of `reference`; in between, references run linearly (midpoint rule)."""
         dt = min(_LONGEST_GAP, max(0.0, dt))
         before, self._reference = self._reference, reference
-        states = self._states
-        slope = self._slope(states, before, before, 0.0)
-        middle = tuple(s + 0.5 * dt * d for s, d in zip(states, slope, strict=True))
-        slope = self._slope(middle, before, reference, 0.5)
-        self._states = tuple(s + dt * d for s, d in zip(states, slope, strict=True))
+        position, velocity, zeta = self.position, self.velocity, self._zeta
+        half = 0.5 * dt
+        acceleration, turning = self._slope(position, velocity, zeta, before)
+        midway = _moved(velocity, acceleration, half)
+        acceleration, turning = self._slope(
+            _moved(position, velocity, half), midway, _moved(zeta, turning, half), _halfway(before, reference)
+        )
+        self.position = _moved(position, midway, dt)
+        self.velocity = _moved(velocity, acceleration, dt)
+        self._zeta = _moved(zeta, turning, dt)
 
     def _slope(
-        self, states: _States, before: ReferenceSample, after: ReferenceSample, share: float
-    ) -> tuple[float, ...]:
-        px, py, pz, vx, vy, vz, roll, pitch, yaw = states
-        rx, ry, rz = _between(before.position, after.position, share)
-        ux, uy, uz = _between(before.velocity, after.velocity, share)
-        ax, ay, az = _between(before.acceleration, after.acceleration, share)
-        turn = (after.yaw - before.yaw + math.pi) % (2.0 * math.pi) - math.pi
-        wanted_yaw = before.yaw + share * turn
+        self, position: Vector, velocity: Vector, zeta: Vector, wanted: ReferenceSample
+    ) -> tuple[Vector, Vector]:
+        """Acceleration (m/s², world) and the rates of roll, pitch and yaw (rad/s)."""
+        (px, py, pz), (rx, ry, rz) = position, wanted.position
+        (vx, vy, vz), (ux, uy, uz) = velocity, wanted.velocity
+        ax, ay, az = wanted.acceleration
+        roll, pitch, yaw = zeta
         c, s = math.cos(yaw), math.sin(yaw)
         ex, ey, dx, dy = px - rx, py - ry, vx - ux, vy - uy
         e = (c * ex + s * ey, c * ey - s * ex, pz - rz, c * dx + s * dy, c * dy - s * dx, vz - uz)
@@ -68,7 +60,7 @@ class LinearBehaviour:
         wanted_pitch = -_product(k_pitch, e) + (c * ax + s * ay) / GRAVITY
         lift = -_product(k_lift, e) / self._mass + az
         zx, zy = roll - wanted_roll, pitch - wanted_pitch
-        zz = (yaw - wanted_yaw + math.pi) % (2.0 * math.pi) - math.pi
+        zz = (yaw - wanted.yaw + math.pi) % (2.0 * math.pi) - math.pi
         a, b, d = self._k_zeta
         rates = (
             -(a[0] * zx + a[1] * zy + a[2] * zz),
@@ -76,14 +68,29 @@ class LinearBehaviour:
             -(d[0] * zx + d[1] * zy + d[2] * zz),
         )
         fx, fy = GRAVITY * pitch, -GRAVITY * roll
-        return (vx, vy, vz, c * fx - s * fy, s * fx + c * fy, lift, *rates)
+        return (c * fx - s * fy, s * fx + c * fy, lift), rates
 
 
-def _between(one: Vector, other: Vector, share: float) -> Vector:
+def _moved(now: Vector, slope: Vector, dt: float) -> Vector:
+    return now[0] + dt * slope[0], now[1] + dt * slope[1], now[2] + dt * slope[2]
+
+
+def _halfway(before: ReferenceSample, after: ReferenceSample) -> ReferenceSample:
+    turn = (after.yaw - before.yaw + math.pi) % (2.0 * math.pi) - math.pi
+    return ReferenceSample(
+        _mean(before.position, after.position),
+        _mean(before.velocity, after.velocity),
+        _mean(before.acceleration, after.acceleration),
+        before.yaw + 0.5 * turn,
+        before.yaw_rate,
+    )
+
+
+def _mean(one: Vector, other: Vector) -> Vector:
     return (
-        one[0] + share * (other[0] - one[0]),
-        one[1] + share * (other[1] - one[1]),
-        one[2] + share * (other[2] - one[2]),
+        one[0] + 0.5 * (other[0] - one[0]),
+        one[1] + 0.5 * (other[1] - one[1]),
+        one[2] + 0.5 * (other[2] - one[2]),
     )
 
 

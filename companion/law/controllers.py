@@ -232,7 +232,7 @@ class Corrected:
             self._command = plain.body_rate
             return ControlStep(plain, ZERO, ZERO, plain, law.normalised(plain.thrust))
 
-        known = actuation.scaled(share)
+        known = actuation if share == 1.0 else actuation.scaled(share)
         (turned_x, turned_y), (more_p, more_q) = self._rates.on_its_way(share)
         p, q, r = state.angular_velocity
         rates = _euler_rates(zeta, (p + more_p, q + more_q, r))
@@ -246,7 +246,7 @@ class Corrected:
         early = self._ahead(state, acceleration, known.rate_delay)
         late = self._ahead(state, acceleration, known.rate_delay + ahead)
         lifted = self._ahead(state, acceleration, lift)
-        reference = preview(known.rate_delay)
+        reference = preview(known.rate_delay) if known.rate_delay else now
         tilt = law.feedback(early, yaw, reference)
         tilt_late = law.feedback(late, yaw, preview(known.rate_delay + ahead))
         thrust = law.feedback(lifted, yaw, preview(lift)).thrust
@@ -262,7 +262,8 @@ class Corrected:
         )
         rows = [features(then, yaw, attitude, voltage, corrector.wants_yaw) for then, attitude in moments]
         correction = corrector.step(rows, ahead, dt, state.height)
-        x, y, z = (a + t for a, t in zip(correction.applied, trim, strict=True))
+        (x, y, z), (trim_x, trim_y, trim_z) = correction.applied, trim
+        x, y, z = x + trim_x, y + trim_y, z + trim_z
         # The attitude loop takes 1 / K to follow: lead the correction by that much.
         led = (
             x + share * correction.rate[0] / self._tilt_gain,
@@ -284,17 +285,28 @@ class Corrected:
         return ControlStep(plain, (x, y, z), correction.raw, command, law.normalised(command.thrust), trim)
 
     def _ahead(self, state: State, acceleration: Vector, h: float) -> State:
-        """The state `h` s later; its height is that of the linear behaviour, where one is expected.
+        """The state `h` s later at this acceleration (m/s², world), attitude as it is.
 
-        Ground effect holds a vehicle up; a correction of the measured height's ground effect takes that away, and a
-        little too much of it lets the vehicle sink. At the expected height the correction is the same along the
-        way, and what the ground does to a deviation is left to help.
+        Its height is that of the linear behaviour, where one is expected. Ground effect holds a vehicle up; a
+        correction of the measured height's ground effect takes that away, and a little too much of it lets the vehicle
+        sink. At the expected height the correction is the same along the way, and what the ground does to a deviation
+        is left to help.
         """
-        later = _after(state, acceleration, h)
-        if self._behaviour is None:
-            return later
-        deviation = state.position[2] - self._behaviour.position[2]
-        return later._replace(height=state.height - deviation + h * self._behaviour.velocity[2])
+        (x, y, z), (u, v, w), (a, b, c) = state.position, state.velocity, acceleration
+        half, behaviour = 0.5 * h * h, self._behaviour
+        if behaviour is None:
+            height = state.height + h * w + half * c
+        else:
+            height = state.height - (z - behaviour.position[2]) + h * behaviour.velocity[2]
+        return State(
+            (x + h * u + half * a, y + h * v + half * b, z + h * w + half * c),
+            (u + h * a, v + h * b, w + h * c),
+            state.quaternion,
+            height,
+            state.battery_voltage,
+            state.angular_velocity,
+            state.specific_force,
+        )
 
     def _faded(self, engaged: float, dt: float) -> float:
         """The share of look-ahead and trim: follows what is engaged, at the pace of a fade at most."""
@@ -315,23 +327,20 @@ class Corrected:
             if not self._at_limit:  # what is missing there is not the correction
                 self._grow(state.position, self._behaviour.position, zeta[2], share * min(LONGEST_STEP, dt))
         c, s = math.cos(zeta[2]), math.sin(zeta[2])
-        x, y, z = (share * t for t in self._trim)
+        x, y, z = self._trim
+        x, y, z = share * x, share * y, share * z
         return c * x + s * y, c * y - s * x, z
 
     def _grow(self, position: Vector, expected: Vector, yaw: float, dt: float) -> None:
-        x, y, z = (p - e for p, e in zip(position, expected, strict=True))
+        x, y, z = position[0] - expected[0], position[1] - expected[1], position[2] - expected[2]
         c, s = math.cos(yaw), math.sin(yaw)
         a, b, d = self._trim_gain
         # Gains belong to the heading frame, the disturbance to the world.
         along, across = dt * a * (c * x + s * y), dt * b * (c * y - s * x)
-        grown = (
-            self._trim[0] + c * along - s * across,
-            self._trim[1] + s * along + c * across,
-            self._trim[2] + dt * d * z,
-        )
+        u, v, w = self._trim
+        u, v, w = u + c * along - s * across, v + s * along + c * across, w + dt * d * z
         most = self._limits.authority
-        u, v, w = (min(most, max(-most, g)) for g in grown)
-        self._trim = (u, v, w)
+        self._trim = min(most, max(-most, u)), min(most, max(-most, v)), min(most, max(-most, w))
 
 
 def _acceleration(state: State) -> Vector:
@@ -340,17 +349,6 @@ def _acceleration(state: State) -> Vector:
         return ZERO
     x, y, z = world_from_body(state.quaternion, state.specific_force)
     return x, y, z - GRAVITY
-
-
-def _after(state: State, acceleration: Vector, h: float) -> State:
-    """The state `h` s later, at this acceleration; attitude as it is."""
-    (x, y, z), (u, v, w), (a, b, c) = state.position, state.velocity, acceleration
-    half = 0.5 * h * h
-    return state._replace(
-        position=(x + h * u + half * a, y + h * v + half * b, z + h * w + half * c),
-        velocity=(u + h * a, v + h * b, w + h * c),
-        height=state.height + h * w + half * c,
-    )
 
 
 def _euler_rates(zeta: Vector, body: Vector) -> Vector:

@@ -150,7 +150,7 @@ def warm_up() -> None:
 
 
 def open_model(onnx: bytes, info: ModelInfo, straight: bool = False) -> Model:
-    """Open a file that was checked before, elsewhere; `straight` where its straight line was found to be the same there.
+    """Open a file that was checked before, elsewhere; `straight` where its straight line was found to be the same.
 
     The golden vectors must come out here too, otherwise the runtime is loaded for it. Raises `InputError` where it does
     not open.
@@ -393,7 +393,8 @@ def _points(info: ModelInfo, beyond: float = 0.0) -> np.ndarray:
     width = np.array([one.high for one in info.features]) - low
     points = np.random.default_rng(0).uniform(size=(_RANGE_SAMPLES, len(low)))
     points[0], points[1] = 0.0, 1.0
-    return low + ((1.0 + 2.0 * beyond) * points - beyond) * width
+    found: np.ndarray = low + ((1.0 + 2.0 * beyond) * points - beyond) * width
+    return found
 
 
 def _time(model: Model) -> tuple[float, float]:

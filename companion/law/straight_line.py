@@ -2,13 +2,13 @@
 
 Effects are some 140 operations on single numbers, and ONNX Runtime takes longer to go from one to the next than to
 compute it. Here each becomes one line of Python, on 64-bit floats, and a network's layers become products of numpy,
-on 32-bit ones. What is compiled is made from the closed list of operators below alone: variables are numbered, constants
-are printed numbers, and no text of the file ever gets into it. A graph with anything else has no straight line, and
-ONNX Runtime flies it.
+on 32-bit ones. What is compiled is made from the closed list of operators below alone: variables are numbered,
+constants are printed numbers, and no text of the file ever gets into it. A graph with anything else has no straight
+line, and ONNX Runtime flies it.
 
-The arithmetic is IEEE 754's, as the runtime's is: what divides by nothing is infinite, what has no root is not a number,
-and nothing raises; the watch over the model decides what becomes of such an answer. That it computes what the runtime
-does is not believed but tried, before each flight with a model, by `companion.law.inference`.
+The arithmetic is IEEE 754's, as the runtime's is: what divides by nothing is infinite, what has no root is not a
+number, and nothing raises; the watch over the model decides what becomes of such an answer. That it computes what the
+runtime does is not believed but tried, whenever a model is checked, by `companion.law.inference`.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ _OPERATORS: dict[str, tuple[int, str]] = {
     "Cos": (1, "cosine({0})"),
     "Identity": (1, "{0}"),
 }
-"""Every operator on columns of single numbers that may be written out, but for `Clip`, `Gather`, `Unsqueeze`, `Concat`."""
+"""What may be written out for columns of single numbers; `Clip`, `Gather`, `Unsqueeze` and `Concat` beside them."""
 
 
 class StraightLine:
@@ -109,7 +109,7 @@ class StraightLine:
         layers = graph.layers
         self._network = _Network(layers, width) if layers else None
 
-    def __call__(self, rows: Rows) -> list[Sequence[float]]:
+    def __call__(self, rows: Rows) -> Sequence[Sequence[float]]:
         """Three accelerations for each row."""
         known, network = self._known, self._network
         if network is None:
@@ -148,7 +148,7 @@ class _Network:
         self._width = width
         self._rooms: dict[int, _Room] = {}
 
-    def rows(self, rows: Rows) -> list[Sequence[float]]:
+    def rows(self, rows: Rows) -> list[list[float]]:
         """Three accelerations for each row."""
         room = self._rooms.get(len(rows))
         if room is None:
@@ -161,7 +161,7 @@ class _Room:
 
     def __init__(self, layers: Sequence[tuple[np.ndarray, bool]], width: int, rows: int) -> None:
         given = np.ones((rows, width + 1), dtype=np.float32)
-        self._given = memoryview(given).cast("B")
+        self._given = memoryview(given.data).cast("B")
         self._pack = Struct(f"{given.size}f").pack_into  # half the time of an assignment
         self._steps = []
         for weights, rectified in layers:
@@ -170,7 +170,7 @@ class _Room:
             given = then
         self._answer = given.tolist
 
-    def answer(self, rows: Rows) -> list[Sequence[float]]:
+    def answer(self, rows: Rows) -> list[list[float]]:
         """Three accelerations for each row."""
         flat: list[float] = []
         for row in rows:

@@ -104,6 +104,7 @@ class Watch:
         """Seconds that the last call of the model took."""
         self._rows = model.rows if isinstance(model, TakesRows) else partial(_one_by_one, model)
         self._ranges = [(r.name, r.low, r.high, _margin(r, self.limits.margin)) for r in ranges]
+        self._lows, self._highs = [r.low for r in ranges], [r.high for r in ranges]
         self._clock = clock
         self._late = 0
         self._outside = self._saturated = 0.0
@@ -134,10 +135,10 @@ class Watch:
     def _judged(self, rows: Sequence[Sequence[float]], dt: float) -> list[tuple[Vector, Vector]]:
         """Raw answer and what of it may act for each row; where anything is wrong with one, nothing of all."""
         self.inference_time = 0.0
-        nothing = [(ZERO, ZERO) for _ in rows]
         if self.reason:
-            return nothing
-        rows = [features[: len(self._ranges)] for features in rows]
+            return [(ZERO, ZERO) for _ in rows]
+        width = len(self._ranges)
+        rows = [features if len(features) == width else features[:width] for features in rows]
         raws: list[Vector] = []
         begin = self._clock()
         try:
@@ -145,21 +146,23 @@ class Watch:
                 raws.append((float(x), float(y), float(z)))
         except Exception as error:  # noqa: BLE001 - whatever a model raises, the flight goes on without it
             self.trip(f"the model raised {type(error).__name__}")
-            return nothing
+            return [(ZERO, ZERO) for _ in rows]
         self.inference_time = self._clock() - begin
-        if not all(math.isfinite(x) and math.isfinite(y) and math.isfinite(z) for x, y, z in raws):
-            self.trip("the model returned a number that is not finite")
-            return nothing
+        for x, y, z in raws:
+            if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+                self.trip("the model returned a number that is not finite")
+                return [(ZERO, ZERO) for _ in rows]
         trusts = [self._trusted(features) for features in rows]
         self.trust, worst = min(trusts)
         self._limit(raws, worst, dt)
         if self.reason:
             return [(raw, ZERO) for raw in raws]
         a, b, c = self.limits.authority
-        return [
-            ((x, y, z), (trust * _within(x, a), trust * _within(y, b), trust * _within(z, c)))
-            for (x, y, z), (trust, _) in zip(raws, trusts, strict=True)
-        ]
+        wanted = []
+        for raw, (trust, _) in zip(raws, trusts, strict=True):
+            x, y, z = raw
+            wanted.append((raw, (trust * _within(x, a), trust * _within(y, b), trust * _within(z, c))))
+        return wanted
 
     def _limit(self, raws: Sequence[Vector], worst: str, dt: float) -> None:
         """Trip on finite answers that come late, are too large, or come from outside the training range."""
@@ -168,7 +171,9 @@ class Watch:
             self.trip(f"inference took {1e3 * self.inference_time:.1f} ms")
             return
         a, b, c = limits.authority
-        excess = max(max(abs(x) / a, abs(y) / b, abs(z) / c) for x, y, z in raws)
+        excess = 0.0
+        for x, y, z in raws:
+            excess = max(excess, abs(x) / a, abs(y) / b, abs(z) / c)
         self._saturated = self._saturated + dt if excess > 1.0 else 0.0
         self._outside = self._outside + dt if self.trust == 0.0 else 0.0
         if excess > limits.absurd:
@@ -190,6 +195,11 @@ class Watch:
         """1 inside the training range, falling to 0 across the margin around it, and the feature that
         decides.
         """
+        for value, low, high in zip(features, self._lows, self._highs, strict=True):
+            if not low <= value <= high:  # true for NaN as well
+                break
+        else:
+            return 1.0, ""
         trust, worst = 1.0, ""
         for value, (name, low, high, margin) in zip(features, self._ranges, strict=True):
             outside = low - value if value < low else value - high
