@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
 
@@ -58,15 +58,6 @@ class GuardLimits:
     ground: float = 0.5
 
 
-@runtime_checkable
-class TakesRows(Protocol):
-    """A model that answers several rows of features in one go."""
-
-    def rows(self, rows: Sequence[Sequence[float]]) -> Sequence[Sequence[float]]:
-        """Three accelerations (m/s², heading frame) for each row."""
-        ...
-
-
 class Look(NamedTuple):
     """What a model says: `raw` as it returned it, `wanted` what of it may act (m/s²), `rate` of x and y (m/s³)."""
 
@@ -78,7 +69,8 @@ class Look(NamedTuple):
 class Watch:
     """One model during one flight.
 
-    `model` maps features to three error accelerations (m/s², heading frame). `ranges` are the features'
+    `model` maps features to three error accelerations (m/s², heading frame); one that has `rows` answers several rows
+    of features in one go. `ranges` are the features'
     training ranges in the model's order. `name` is the model's hash, `actuation` what it knows of the path from
     command to motion. `clock` tells what an inference took: this thread's own processor time, for what others take
     from it says nothing of the model.
@@ -102,7 +94,7 @@ class Watch:
         """Share of the last answer that was believed: 1 in the training range, 0 well outside."""
         self.inference_time = 0.0
         """Seconds that the last call of the model took."""
-        self._rows = model.rows if isinstance(model, TakesRows) else partial(_one_by_one, model)
+        self._rows = getattr(model, "rows", None) or partial(_one_by_one, model)
         self._ranges = [(r.name, r.low, r.high, _margin(r, self.limits.margin)) for r in ranges]
         self._lows, self._highs = [r.low for r in ranges], [r.high for r in ranges]
         self._clock = clock
