@@ -35,7 +35,7 @@ class Bookkeeping:
     """
 
     def __init__(self, write: Write, tell: Callable[[str], None]) -> None:
-        self.dropped = self._told = 0
+        self._refused = self._failed = self._told = 0  # each counted by one thread
         self._write_tick, self._tell = write, tell
         self._notes: deque[_Note] = deque()
         self._since = 0
@@ -45,10 +45,15 @@ class Bookkeeping:
         self._thread = threading.Thread(target=self._work, name="bookkeeping", daemon=True)
         self._thread.start()
 
+    @property
+    def dropped(self) -> int:
+        """Ticks that are lost."""
+        return self._refused + self._failed
+
     def note(self, odometry: Odometry, latest: Latest, outcome: Outcome, latency: float) -> None:
         """Keep what is known now for the tick of this outcome, which must not change any more; never blocks."""
         if len(self._notes) >= WAITING:
-            self.dropped += 1
+            self._refused += 1
             return
         self._notes.append((odometry, known_now(latest), outcome, latency))
         self._since += 1
@@ -66,7 +71,7 @@ class Bookkeeping:
                     data = make_tick(odometry, known, outcome, latency).SerializeToString()
                     self._write_tick(data, odometry.vehicle_time_us, odometry.host_time_ns)
                 except Exception:  # noqa: BLE001 - one tick that cannot be written must not end the book-keeping
-                    self.dropped += 1
+                    self._failed += 1
             dropped = self.dropped
             if dropped != self._told:
                 self._tell(f"{dropped - self._told} ticks are neither recorded nor published")
