@@ -18,7 +18,7 @@ Pair = tuple[float, float]
 
 _LONGEST_GAP = 0.1
 """s between two ticks after which the model of the rate loop starts anew."""
-_STEP = 0.0025  # s, of the integration: a tenth of the shortest lag met
+STEP = 0.0025  # s, of the integration: a tenth of the shortest lag met
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class RateModel:
         lag, integral = self.actuation.rate_lag, self.actuation.rate_integral
         (x, y), (p, q), (i, j), (a, b) = self._angle, self._rate, self._integral, command
         if lag > 0.0:
-            steps = max(1, math.ceil(dt / _STEP))
+            steps = max(1, math.ceil(dt / STEP))
             h = dt / steps
             follow = 1.0 - math.exp(-h / lag)
             for _ in range(steps):

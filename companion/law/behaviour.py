@@ -14,7 +14,7 @@ from trueflight.models.vehicle import GRAVITY
 
 Vector = tuple[float, float, float]
 
-_LONGEST_GAP = 0.1
+LONGEST_GAP = 0.1
 """s; longer steps are cut, so that a gap in the odometry cannot make the integration unstable."""
 
 
@@ -31,7 +31,7 @@ class LinearBehaviour:
 
     def step(self, reference: ReferenceSample, dt: float) -> None:
         """Go on by `dt` s to the time of `reference`; in between, references run linearly (midpoint rule)."""
-        dt = min(_LONGEST_GAP, max(0.0, dt))
+        dt = min(LONGEST_GAP, max(0.0, dt))
         before, self._reference = self._reference, reference
         position, velocity, zeta = self.position, self.velocity, self._zeta
         half = 0.5 * dt

@@ -42,7 +42,7 @@ from trueflight.models.vehicle import GRAVITY
 Preview = Callable[[float], ReferenceSample]
 """The reference so many seconds from now; it holds still after its end."""
 
-_AHEAD = 0.02
+AHEAD = 0.02
 """s over which the correction's rate of change is taken, where no lag asks for more."""
 LONGEST_STEP = 0.1  # s of integration and fading in one tick, so that a gap in the odometry gives no jump
 INTEGRAL_AUTHORITY = 3.0  # m/s², the most that the integral of `lqr_integral` may ask for per axis
@@ -240,7 +240,7 @@ class Corrected:
         tilted = (zeta[0] + turned[0], zeta[1] + turned[1], yaw)
 
         # Three moments: when a rate commanded now acts, a little later, and when a thrust commanded now acts.
-        ahead = max(known.rate_lag, _AHEAD)
+        ahead = max(known.rate_lag, AHEAD)
         lift = known.thrust_delay + known.thrust_lag
         acceleration = _acceleration(state)
         early = self._ahead(state, acceleration, known.rate_delay)

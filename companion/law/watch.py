@@ -95,7 +95,7 @@ class Watch:
         self.inference_time = 0.0
         """Seconds that the last call of the model took."""
         self._rows = getattr(model, "rows", None) or partial(_one_by_one, model)
-        self._ranges = [(r.name, r.low, r.high, _margin(r, self.limits.margin)) for r in ranges]
+        self._ranges = [(r.name, r.low, r.high, margin(r, self.limits.margin)) for r in ranges]
         self._lows, self._highs = [r.low for r in ranges], [r.high for r in ranges]
         self._clock = clock
         self._late = 0
@@ -212,6 +212,7 @@ def _within(value: float, authority: float) -> float:
     return min(authority, max(-authority, value))
 
 
-def _margin(feature: Range, share: float) -> float:
+def margin(feature: Range, share: float) -> float:
+    """How far beyond its training range a feature is believed a little: `share` of its width, in the feature's unit."""
     floor = _FLOORS.get(feature.unit, 0.1 * max(abs(feature.low), abs(feature.high), 1e-6))
     return max(share * (feature.high - feature.low), floor)

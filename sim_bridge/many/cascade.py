@@ -131,17 +131,17 @@ class Cascades:
             asked += more
         return self.limited(asked)
 
-    def corrected(self, attitude: np.ndarray, delta: np.ndarray) -> np.ndarray:
-        """(22): attitude (3, N) against error accelerations (3, N) in m/s², heading frame, within the limits."""
+    def tilted_by(self, attitude: np.ndarray, delta: np.ndarray, thrust: np.ndarray) -> np.ndarray:
+        """(22): attitude (3, N) with another thrust (N,), tilted against error accelerations (2, N) in m/s², heading
+        frame, within the limits."""
         return self.limited(
-            np.array(
-                [
-                    attitude[0] + delta[1] / GRAVITY,
-                    attitude[1] - delta[0] / GRAVITY,
-                    attitude[2] - self.mass * delta[2],
-                ]
-            )
+            np.array([attitude[0] + delta[1] / GRAVITY, attitude[1] - delta[0] / GRAVITY, thrust])
         )
+
+    def within(self, thrust: np.ndarray) -> np.ndarray:
+        """Thrusts (N,) in N within what the vehicles should give."""
+        given: np.ndarray = np.minimum(np.maximum(thrust, self._thrust_low), self._thrust_high)
+        return given
 
     def euler_rates(self, zeta: np.ndarray, attitude: np.ndarray, yaw: np.ndarray) -> np.ndarray:
         """(13): rates of roll, pitch, yaw (3, N) that take `zeta` (3, N) to the attitude and yaw (N,) asked for."""

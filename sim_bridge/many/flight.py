@@ -73,7 +73,7 @@ class _Flight:
         self._plans = plans
         self._period = self._steps * PHYSICS_STEP
         self._courses = Courses(plans, self._period)
-        self._crews = crews(plans, self._courses)
+        self._crews = crews(plans, self._period)
         self._vehicles = Vehicles(plans, self._steps)
         self._ground = self._vehicles.bodies.standing_height
         self.under_way = np.ones(count, dtype=bool)
@@ -174,27 +174,27 @@ class _Flight:
         self.under_way = here & ~gone
 
 
-def crews(plans: Sequence[Plan], courses: Courses) -> list[tuple[np.ndarray, Crew]]:
+def crews(plans: Sequence[Plan], period: float) -> list[tuple[np.ndarray, Crew]]:
     """The flights of each kind of controller, with that controller for all of them."""
     found: list[tuple[np.ndarray, Crew]] = []
     for name in dict.fromkeys(plan.controller for plan in plans):
         where = np.array([i for i, plan in enumerate(plans) if plan.controller == name])
         mine = [plans[i] for i in where]
         laws = [ControlLaw(plan.vehicle, plan.design) for plan in mine]
-        found.append((where, _crew(name, mine, laws, courses, where)))
+        found.append((where, _crew(name, mine, laws, period)))
     return found
 
 
-def _crew(
-    name: str, plans: Sequence[Plan], laws: Sequence[ControlLaw], courses: Courses, where: np.ndarray
-) -> Crew:
+def _crew(name: str, plans: Sequence[Plan], laws: Sequence[ControlLaw], period: float) -> Crew:
     if name == LQR:
         return ManyLqr(laws)
     if name == LQR_INTEGRAL:
         return ManyLqrIntegral(laws)
     if name != CORRECTED:
         raise InputError(f"controller '{name}' is unknown")
-    raise InputError("not yet")
+    from trueflight.sim_bridge.many.corrected import ManyCorrected
+
+    return ManyCorrected(laws, plans, period)
 
 
 def _joined(parts: Sequence[tuple[np.ndarray, Steps]], count: int) -> Steps:

@@ -9,7 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from onnx_models import constant_model, drag_model, linear_model, nan_model
 
+from trueflight.companion.law.controllers import TrimLimits
+from trueflight.models import contract
 from trueflight.models.design import Design
 from trueflight.models.errors import InputError
 from trueflight.models.record import read_record
@@ -116,15 +119,21 @@ def test_every_effect_alone_and_all_of_rich(vehicle: Vehicle, design: Design) ->
 
 def test_paths_controllers_batteries_and_what_begins_in_flight(vehicle: Vehicle, design: Design) -> None:
     paths = [
-        trajectory("lemniscate", width=1.0, depth=0.6, height=0.15, laps=1.0),
-        trajectory("translation", plane="z", size=1.0, speed=4.0, height=1.0),
-        trajectory("rotation", angle=0.5, rate=1.5),
+        Trajectory("low", (min_jerk((0.0, 0.0, 0.15, 0.0), (1.0, 0.5, 0.15, 0.0), 1.6),)),
+        Trajectory(
+            "drop",
+            (min_jerk((0.0, 0.0, 3.2, 0.0), (0.2, 0.0, 1.4, 0.0), 0.8), hold((0.2, 0.0, 1.4, 0.0), 0.8)),
+        ),
+        Trajectory(
+            "turn",
+            (min_jerk((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0, 1.0), 1.5), hold((0.0, 0.0, 1.0, 1.0), 0.8)),
+        ),
     ]
     rows = "\n".join(f"{0.2 * i},{0.1 * i},0,1,{0.05 * i}" for i in range(20))
     paths.append(trajectory_from_csv(f"t,x,y,z,yaw\n{rows}\n", "setpoints"))
     hidden = (
-        ("ceiling_effect", "ground_effect", "translational_lift"),
-        ("vortex_ring:0.4", "gyroscopic", "battery_sag"),
+        ("ceiling_effect", "ground_effect", "gyroscopic"),
+        ("vortex_ring:0.4", "rotor_drag", "battery_sag"),
         ("wind:4@1", "rotor_damage:0.1@2.004", "thrust_gain:1.1@1"),
         ("payload:0.2", "imu_lever_arm", "estimator_delay:0.014", "rotor_drag:0.4@0.5"),
     )
@@ -222,3 +231,47 @@ def test_rates_that_differ_are_refused(vehicle: Vehicle, design: Design) -> None
     plan = Plan(vehicle, design, trajectory("hover"))
     with pytest.raises(InputError, match="one --rate"):
         fly_many([plan, replace(plan, rate=50.0)])
+
+
+KNOWN = {
+    "rate_delay": 0.013, "rate_lag": 0.05, "rate_integral": 1.3, "thrust_delay": 0.005, "thrust_lag": 0.02,
+}  # fmt: skip
+
+
+def test_the_corrected_cascade_with_its_guard(vehicle: Vehicle, design: Design) -> None:
+    there, back = (0.0, 0.0, 0.4, 0.0), (1.5, 0.7, 0.9, 0.6)
+    path = Trajectory("and back", (min_jerk(there, back, 1.5), min_jerk(back, there, 1.5)))
+    named = {contract.KEY_ACTUATION: KNOWN}
+    yaws = np.zeros((12, 3))
+    yaws[10:, :2] = 0.3
+    models = {
+        "drag": drag_model(0.4, metadata=named),
+        "drag, acting at once": drag_model(0.4),
+        "of the world": linear_model(
+            yaws, metadata={contract.KEY_ACTUATION: {**KNOWN, "rate_integral": 0.0}}
+        ),
+        "beyond its authority": constant_model(3.1, 0.0, 0.0, metadata=named),
+        "absurd": constant_model(0.0, 16.0, 0.0, metadata=named),
+        "no number": nan_model(0.2, 0.3),
+    }
+    words = (["rotor_drag:0.4"], ["rich"], ["wind:3", "transport_delay:0.02"])
+    plans = [
+        Plan(
+            vehicle, design, path, choose(words[i % 3], vehicle, i), 20 + i, model=onnx, settle=1.3 * (i % 2),
+            trim=TrimLimits(bandwidth=0.4 if i else 0.0), battery=BatteryState(0.8 if i != 1 else 0.12, 1.0),
+        )
+        for i, onnx in enumerate(models.values())
+    ]  # fmt: skip
+    plans.append(replace(plans[0], model=None, controller="lqr"))
+    found = each_is_as_alone(plans, close=1e-7)
+    told = [flown.guard for flown in found[:-1]]
+    assert told[0] == told[2] == "active", told
+    assert [text.startswith("tripped") for text in told[3:]] == [True, True, True], told
+
+
+def test_many_flights_of_one_model(vehicle: Vehicle, design: Design) -> None:
+    onnx = drag_model(0.4, metadata={contract.KEY_ACTUATION: KNOWN})
+    each_is_as_alone(
+        [Plan(vehicle, design, SHORT, choose(["rotor_drag"], vehicle, i), i, model=onnx) for i in range(5)],
+        close=1e-5,  # together it is computed in 32 bits
+    )
