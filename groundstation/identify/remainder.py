@@ -124,6 +124,13 @@ def unexplained(measurement: Measurement, residual: np.ndarray) -> Unexplained:
     )
 
 
+def how_much_is_left(measurement: Measurement, residual: np.ndarray) -> Unexplained:
+    """Whether `residual` (K, A) is above the noise, alone: what it goes with is not asked."""
+    beyond = misfits(measurement, residual)
+    share = excess(measurement, residual) if beyond else 0.0
+    return Unexplained(bool(beyond), share, tuple(x.text for x in beyond), misfit=beyond)
+
+
 @dataclass(frozen=True)
 class _Constant:
     text: str

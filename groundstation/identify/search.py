@@ -186,14 +186,19 @@ class Search:
     """One search: states are kept by their set of choices, for the steps visit many sets again.
 
     `tried` is the number of candidates that share the risk of a chance find, where it is not that of `problem`;
+    Without `other_sets` no sets are looked for that explain the flight as well as the one that the steps lead to.
     `dropped` are the effects that were left out because the held-out flight does not want them, `of_another_law` those
     that may be the difference between the vehicle's law and that of the effect that each names.
     """
 
     def __init__(
-        self, problem: Problem, progress: Callable[[str], None] = lambda _: None, tried: int | None = None
+        self,
+        problem: Problem,
+        progress: Callable[[str], None] = lambda _: None,
+        tried: int | None = None,
+        other_sets: bool = True,
     ) -> None:
-        self.problem, self.progress = problem, progress
+        self.problem, self.progress, self._asks_for_others = problem, progress, other_sets
         self.significance = FAMILY / max(1, len(problem.choices) if tried is None else tried)
         self.dropped: set[str] = set()
         self.of_another_law: dict[str, str] = {}
@@ -370,7 +375,8 @@ class Search:
         in full; none where no more than noise is left."""
         key = frozenset(current.choices)
         if key not in self._sets:
-            found = () if self.problem.adequate(current.fit) else self._best_subsets(current)
+            enough = not self._asks_for_others or self.problem.adequate(current.fit)
+            found = () if enough else self._best_subsets(current)
             self._sets[key] = tuple(
                 s
                 for s in map(self.state, found)

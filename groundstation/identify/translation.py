@@ -28,7 +28,7 @@ from trueflight.groundstation.identify.gusts import gusts_of, told_as_gusts
 from trueflight.groundstation.identify.lateness import late_instead
 from trueflight.groundstation.identify.one_by_one import shares, with_shares
 from trueflight.groundstation.identify.rates import judge_rates
-from trueflight.groundstation.identify.remainder import unexplained
+from trueflight.groundstation.identify.remainder import how_much_is_left, unexplained
 from trueflight.groundstation.identify.ridges import ridges, with_ridges
 from trueflight.groundstation.identify.rotation import RotationalFindings, judge_rotation
 from trueflight.groundstation.identify.rotors import MeasuredRotors, has_rotor_speeds
@@ -113,11 +113,11 @@ def _diagnose(
         drift = timed.drift
         beside, wandering, course = beside_drift(entire, kept, drift)
         if possible(entire.effects[drift.choice.effect], course):
-            diagnosis = _report(beside, wandering, beside, rotation, {drift.choice.effect: course})
+            diagnosis = report(beside, wandering, beside, rotation, {drift.choice.effect: course})
             return _with_drift(diagnosis, drift, course)
         # what cannot be is no drift, but may be a change at a moment
         kept = everything.agreed_by_held_out(in_time(everything, found, drifts=False).state)
-    return _report(search, search.state(kept.choices), everything, rotation)
+    return report(search, search.state(kept.choices), everything, rotation)
 
 
 def _with_drift(diagnosis: Diagnosis, drift: Drift, course: OverTime) -> Diagnosis:
@@ -162,21 +162,25 @@ def _spread(flight: Flight, bandwidth: float | None) -> tuple[Measurement, ...]:
     return tuple(found)
 
 
-def _report(
+def report(
     search: Search,
     found: State,
     everything: Search,
     rotation: RotationalFindings,
     drifts: Mapping[str, OverTime] = MappingProxyType({}),
+    structure: bool = True,
 ) -> Diagnosis:
-    """The verdicts; figures of what was found are those of the whole flight, which `everything` sees."""
+    """The verdicts; figures of what was found are those of the whole flight, which `everything` sees. Without
+    `structure` of what is left only its size is asked, not what it goes with."""
     problem, entire = _force(search), _force(everything)
     here = everything.state(found.choices).fit
     times = {c.effect: t for c in found.choices if (t := over_time(entire, here, c)) is not None}
     times |= drifts
     m, base = entire.flights.measurements[0], entire.base
-    remains = unexplained(m, here.residual)
-    gusts = gusts_of(m, here.residual, remains, entire.push_of_air(here)) if remains.misfit else None
+    remains = unexplained(m, here.residual) if structure else how_much_is_left(m, here.residual)
+    gusts = None
+    if structure and remains.misfit:
+        gusts = gusts_of(m, here.residual, remains, entire.push_of_air(here))
     doubt = Weighing(entire, here, m.noise[list(m.axes)]) if remains.misfit else None
     verdicts, rate_terms = _verdicts(search, found, here, entire, rotation, doubt)
     verdicts = in_words(verdicts, times)
