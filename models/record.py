@@ -315,7 +315,8 @@ def read_record(path: str | Path, ticks: bool = True) -> FlightRecord:
     """
     path = Path(path)
     with unreadable(path, "the flight record", _OURS), path.open("rb") as stream:
-        raw = _Raw(TickColumns(os.fstat(stream.fileno()).st_size))
+        into = TickColumns(os.fstat(stream.fileno()).st_size)
+        raw = _Raw(into)
         end = _read_all(stream, raw, ticks)
     if end == _NO_MCAP:
         raise InputError(f"{path}: {end}; {_OURS}")
@@ -344,10 +345,45 @@ def read_record(path: str | Path, ticks: bool = True) -> FlightRecord:
         except InputError as error:
             notes.append(f"its design file is damaged: {error}")
     with unreadable(path, "the flight record", _OURS):
-        columns = raw.ticks.columns() if ticks else {}
+        columns = into.columns() if ticks else {}
     return FlightRecord(
         str(path), columns, tuple(raw.events), raw.metadata, vehicle, design, end is not None, tuple(notes)
     )  # fmt: skip
+
+
+def read_messages(path: str | Path) -> tuple[list[Tick], list[Event]]:
+    """Ticks and events of a flight record as they were sent, also of one that still grows or was cut short.
+
+    Raises `InputError` for a file that cannot be read, is no MCAP, or holds no tick.
+    """
+    path = Path(path)
+    with unreadable(path, "the flight record", _OURS), path.open("rb") as stream:
+        kept = _Kept()
+        raw = _Raw(kept)
+        end = _read_all(stream, raw, True)
+        ticks = [Tick.FromString(data) for data in kept.messages]
+    if not ticks:
+        raise InputError(f"{path}: holds no tick{'' if end is None else f' ({end})'}; {_OURS}")
+    return ticks, raw.events
+
+
+class _Kept:
+    """Ticks as they stand in a record, in place of their columns."""
+
+    def __init__(self) -> None:
+        self.messages: list[bytes] = []
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.messages)
+
+    def add(self, ticks: list[memoryview]) -> None:
+        """Take ticks."""
+        self.messages += map(bytes, ticks)
+
+    def settle(self) -> None:
+        """Nothing waits here."""
 
 
 _OURS = "give a record written by `companion`"
@@ -363,7 +399,7 @@ def _text(attachment: bytes, where: str) -> str:
 
 @dataclass
 class _Raw:
-    ticks: TickColumns
+    ticks: TickColumns | _Kept
     events: list[Event] = field(default_factory=list)
     metadata: dict[str, str] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)

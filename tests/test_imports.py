@@ -45,8 +45,9 @@ ROOMS: dict[str, set[str]] = {
     "evaluate": {"results", "reading", "measured", "design", "identify"},
     "learn": {"measured", "identify", "evaluate"},
     "versions": {"results", "reading", "measured", "identify"},
-    "output": {"results", "reading", "design", "identify", "evaluate", "learn", "versions"},
-    "views": {"results", "operate", "evaluate", "learn", "output"},
+    "live": {"results", "reading", "operate", "identify"},
+    "output": {"results", "reading", "design", "identify", "evaluate", "learn", "versions", "live"},
+    "views": {"results", "evaluate", "learn", "live", "output"},
     "report": {"results", "evaluate", "output"},
     "study": {
         "results", "reading", "operate", "identify", "evaluate", "learn", "versions", "output", "views", "report",
@@ -60,7 +61,7 @@ ROOMS: dict[str, set[str]] = {
     },
     "commands": {
         "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",
-        "views", "report", "study", "export", "workbench",
+        "views", "report", "study", "export", "workbench", "live",
     },
 }  # fmt: skip
 """The rooms of groundstation/ from the bottom to the top, and what each may import: only what stands above it here."""

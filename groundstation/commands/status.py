@@ -1,8 +1,7 @@
-"""`groundstation status` and `monitor`: what a companion is doing."""
+"""`groundstation status` and `ros2-bridge`: what a companion is doing, for a person and for ROS 2."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -28,7 +27,6 @@ def register(app: typer.Typer) -> None:
     app.command("status", epilog="Example: groundstation status -e tcp/192.168.1.7:7447 --json")(
         linked(status_command)
     )
-    app.command("monitor", epilog="Example: groundstation monitor --save flight.rrd")(linked(monitor_command))
     app.command(
         "ros2-bridge",
         epilog="Example: groundstation ros2-bridge -e tcp/192.168.1.7:7447; then, with "
@@ -129,27 +127,6 @@ def _several(batteries: list[dict[str, Any]]) -> str:
         for one in batteries
     )
     return f"; of {', '.join(told)}"
-
-
-def monitor_command(
-    save: Annotated[
-        Path | None, typer.Option("--save", help="Write a Rerun recording instead of opening the viewer.")
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option("--seconds", help="Stop after this long; default: until Ctrl-C.", min=0.1)
-    ] = None,
-    *,
-    settings: Settings,
-) -> None:
-    """Watch a vehicle live in Rerun: path, reference, commands, correction, guard, latency."""
-    from trueflight.groundstation.operate.link import Link
-    from trueflight.groundstation.views import monitor
-
-    with Link(settings) as link:
-        print_warning(link.warning)
-        console.print(f"watching '{link.vehicle}'; Ctrl-C ends", highlight=False)
-        seen = monitor(link, save, seconds)
-    console.print(f"{seen} ticks seen" + (f", written to {escape(str(save))}" if save is not None else ""))
 
 
 def ros2_command(

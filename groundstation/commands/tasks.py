@@ -129,7 +129,8 @@ TASKS: dict[str, dict[str, Entry]] = {
         ),
         "status": Entry("status", "What the companion is doing, and whether it could fly now."),
         "monitor": Entry(
-            "status", "Watch a vehicle live in Rerun: path, reference, commands, correction, guard, latency."
+            "monitor",
+            "Watch vehicles live in Rerun, and hear what a diagnosis will say: what is missing, and what changed.",
         ),
         "ros2-bridge": Entry(
             "status",

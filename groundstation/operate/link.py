@@ -210,6 +210,10 @@ class Link:
             file.flush()
         return target
 
+    def head_of_record(self, name: str) -> bytes:
+        """The first piece of a record: what stands before its ticks is in it. Raises `InputError` as `fetch_record`."""
+        return self._piece(name, 0)[0]
+
     def follow(
         self,
         on_tick: Callable[[Tick], None] | None = None,

@@ -81,28 +81,7 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
             "noise_floor": d.noise_floor,
             "unit": UNIT,
         },
-        "effects": [
-            {
-                "name": e.name,
-                "verdict": e.verdict,
-                "rank": e.rank,
-                "variance_share": e.variance_share,
-                "p_value": e.p_value,
-                "parameters": {p.name: interval_table(p) for p in e.parameters if not p.flight},
-                "per_flight": _per_flight(e),
-                "indistinguishable_from": list(e.indistinguishable_from),
-                "advice": e.advice,
-                "seen_in": e.seen_in,
-                "confidence": e.confidence,
-                "rests_on": e.rests_on,
-                "undetermined": list(e.undetermined),
-                "products": {p.name: interval_table(p) for p in e.products},
-                "changes": [] if e.over_time is None else [asdict(c) for c in e.over_time.changes],
-                "when": "" if e.over_time is None else "; ".join(e.over_time.lines),
-                "over_time": None if e.over_time is None else over_time_table(e.over_time),
-            }
-            for e in d.effects
-        ],
+        "effects": [effect_found_table(e) for e in d.effects],
         "remarks": list(d.remarks),
         "alternatives": [list(names) for names in d.alternatives],
         "unexplained": asdict(d.unexplained),
@@ -120,6 +99,29 @@ def diagnosis_table(d: Diagnosis) -> dict[str, Any]:
     if d.validation_before is not None:
         table["validation_rms"] = {"before": d.validation_before, "after": d.validation_after, "unit": UNIT}
     return plain(table)
+
+
+def effect_found_table(e: EffectVerdict) -> dict[str, Any]:
+    """The JSON of what a diagnosis says of one effect."""
+    return {
+        "name": e.name,
+        "verdict": e.verdict,
+        "rank": e.rank,
+        "variance_share": e.variance_share,
+        "p_value": e.p_value,
+        "parameters": {p.name: interval_table(p) for p in e.parameters if not p.flight},
+        "per_flight": _per_flight(e),
+        "indistinguishable_from": list(e.indistinguishable_from),
+        "advice": e.advice,
+        "seen_in": e.seen_in,
+        "confidence": e.confidence,
+        "rests_on": e.rests_on,
+        "undetermined": list(e.undetermined),
+        "products": {p.name: interval_table(p) for p in e.products},
+        "changes": [] if e.over_time is None else [asdict(c) for c in e.over_time.changes],
+        "when": "" if e.over_time is None else "; ".join(e.over_time.lines),
+        "over_time": None if e.over_time is None else over_time_table(e.over_time),
+    }
 
 
 def interval_table(p: ParameterEstimate) -> dict[str, Any]:

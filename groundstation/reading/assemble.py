@@ -45,6 +45,7 @@ def assemble(
     accelerometer: bool = True,
     named_by: Mapping | None = None,
     rates: dict[str, float] | None = None,
+    on_disk: bool = True,
 ) -> Flight:
     """Check columns (N, ...) by attribute of `Flight` on the clock `t` (N,), put them on an even clock and
     find what was flown.
@@ -54,7 +55,8 @@ def assemble(
     commands flew it; `notes` are told to the user; `most_lost` is the share of samples that gaps may take; `mapping`
     corrects the columns; `accelerometer` is False where the specific force is an estimator's; `named_by`
     is the mapping that they were read by already; `rates` are the true ones (Hz) of columns that were interpolated
-    onto the clock. Raises `InputError` for anything that cannot be analysed.
+    onto the clock; `on_disk` is False where `path` is a name alone. Raises `InputError` for anything that cannot be
+    analysed.
     """
     origin = str(path)
     columns = {name: column for name, column in columns.items() if name not in left_out(mapping)}
@@ -117,7 +119,7 @@ def assemble(
             "specific_force" if "specific_force" in given else "velocity"
         ),
         origin=origin,
-        data_hash=_hash_of(path),
+        data_hash=_hash_of(path) if on_disk else "",
         notes=(*said, *agreed.notes, *(c.text for c in checks[len(agreed.checks) :] if c.verdict == "weak")),
         extra={name: _of(column, agreed.keep) for name, column in extras.items()},
         consistency=checks,

@@ -46,7 +46,18 @@ def read_flight_record(
     flight, or any plausible column.
     """
     record = read_record(path)
-    believed = _vehicle(path, record, vehicle)
+    return flight_of_record(path, record, _vehicle(path, record, vehicle), mapping)
+
+
+def flight_of_record(
+    path: Path,
+    record: FlightRecord,
+    believed: Vehicle,
+    mapping: Mapping | None = None,
+    on_disk: bool = True,
+) -> Flight:
+    """The flight of a `record` of the vehicle `believed`, as `read_flight_record`; `path` is its name in messages, and
+    a file where it is `on_disk`."""
     ticks, foreign = _of_the_vehicle(path, record.ticks)
     columns = {name: ticks[name] for name in COLUMNS if name in ticks and not _unknown(ticks[name])}
     if "battery_voltage" in columns and not np.any(columns["battery_voltage"] > 0):
@@ -84,6 +95,7 @@ def read_flight_record(
         commanded=commanded,
         notes=notes,
         mapping=mapping,
+        on_disk=on_disk,
     )
 
 

@@ -2,7 +2,7 @@
 
 from trueflight.groundstation.views.analysis import write_analysis
 from trueflight.groundstation.views.comparison import write_comparison
-from trueflight.groundstation.views.monitor import monitor
+from trueflight.groundstation.views.monitor import viewer
 from trueflight.groundstation.views.narrow import write_narrow
 from trueflight.groundstation.views.side_by_side import write_side_by_side
 from trueflight.groundstation.views.tracking import write_tracking
@@ -12,7 +12,7 @@ from trueflight.groundstation.views.waterfall import write_before_after
 from trueflight.groundstation.views.where import write_where
 
 __all__ = [
-    "monitor",
+    "viewer",
     "write_ablation",
     "write_analysis",
     "write_before_after",

@@ -1,11 +1,11 @@
-"""Live: the vehicle in space with its path and reference, commands, correction, guard, latency, battery."""
+"""Live: vehicles in space with path and reference, commands, correction, guard, latency, battery, diagnosis."""
 
 from __future__ import annotations
 
-import contextlib
-import queue
 import time
 from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +13,17 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from trueflight.groundstation.operate.link import Link
-from trueflight.groundstation.operate.processes import told_to_end
+from trueflight.groundstation.live.said import Alert, Said
 from trueflight.groundstation.views import scene
 from trueflight.groundstation.views.colour import AXES, LINEAR, MEASURED, NEWEST, REFERENCE, WARNING, Colour
+from trueflight.groundstation.views.live import Panes, panes
 from trueflight.groundstation.views.recording import TIME, recording, text
 from trueflight.models.errors import InputError
 from trueflight.models.record_pb2 import Event, Tick, Vector3
 from trueflight.models.vehicle import Vehicle
 
-PERIOD = 0.1  # s between two updates of the picture
 TRAIL = 30.0  # s of path that stay in sight
-ASK = 1.0  # s between two questions for the names of models, while connected
 WINDOW = 20.0  # s of the curves
-HISTORY = 200  # ticks of the past that are asked for
-SILENCE = 2.0  # s without a tick that the pilot is told of
 LEVELS = {"info": rr.TextLogLevel.INFO, "warning": rr.TextLogLevel.WARN, "error": rr.TextLogLevel.ERROR}
 
 CURVES: tuple[tuple[str, str, Colour], ...] = (
@@ -56,120 +52,149 @@ CURVES: tuple[tuple[str, str, Colour], ...] = (
 )
 
 
-def monitor(link: Link, save: Path | None = None, seconds: float | None = None) -> int:
-    """Show a companion's ticks and events until told to end (Ctrl-C, SIGTERM, a closed terminal), or for `seconds`;
-    returns how many ticks were seen.
+@contextmanager
+def viewer(vehicles: Sequence[str], save: Path | None = None, diagnosed: bool = True) -> Iterator[Views]:
+    """Everything that the vehicles tell in one view: the Rerun viewer, or the recording `save`; `diagnosed` where looks
+    at the flight are shown, too.
 
-    Opens the Rerun viewer, or writes the recording `save`. Raises `InputError` where there is no viewer to
-    open.
+    Raises `InputError` where there is no viewer to open.
     """
     if save is not None:
-        with recording(save, "monitor", f"{link.vehicle}, live") as stream:
-            return Monitor(stream, link.vehicle).run(link, seconds)
+        with recording(save, "monitor", f"{', '.join(vehicles)}, live") as stream:
+            yield Views(stream, vehicles, diagnosed)
+        return
     stream = rr.RecordingStream("trueflight monitor")
     try:
         stream.spawn()
     except (RuntimeError, OSError) as error:
         raise InputError(
-            f"the Rerun viewer does not open ({error}); is there a display? Use --save FILE"
+            f"the Rerun viewer does not open ({error}); is there a display? Use --save FILE, or --no-view"
         ) from None
-    return Monitor(stream, link.vehicle).run(link, seconds)
+    yield Views(stream, vehicles, diagnosed)
+
+
+class Views:
+    """One view of several vehicles, each under its own name; of a single one at the root."""
+
+    def __init__(self, stream: rr.RecordingStream, vehicles: Sequence[str], diagnosed: bool = True) -> None:
+        alone = len(vehicles) == 1
+        self._began = time.monotonic()
+        self._of = {
+            name: (
+                Monitor(stream, name, "" if alone else f"{name}/", "space" if alone else f"space/{name}"),
+                Panes(stream, name, "" if alone else f"{name}/"),
+            )
+            for name in vehicles
+        }
+        stream.log("space", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        stream.send_blueprint(blueprint(diagnosed) if alone else blueprint_of(vehicles, diagnosed))
+
+    def ticks(self, name: str, ticks: Sequence[Tick]) -> None:
+        """As in `live.watch.Shown`."""
+        self._of[name][0].add_ticks(list(ticks), time.monotonic() - self._began)
+
+    def past(self, name: str, ticks: Sequence[Tick]) -> None:
+        """As in `live.watch.Shown`."""
+        self._of[name][0].add_past(list(ticks))
+
+    def event(self, name: str, event: Event) -> None:
+        """As in `live.watch.Shown`."""
+        self._of[name][0].add_event(event)
+
+    def state(self, name: str, silent: float, status: dict[str, Any]) -> None:
+        """As in `live.watch.Shown`."""
+        self._of[name][0].tell(silent, status)
+
+    def said(self, name: str, said: Said, alerts: Sequence[Alert], news: Sequence[Alert], age: float) -> None:
+        """As in `live.watch.Shown`."""
+        monitor, panes = self._of[name]
+        panes.said(said, alerts, news, age, monitor.now)
 
 
 class Monitor:
-    """Turns ticks and events into a recording, a batch at a time."""
+    """One vehicle's ticks and events, a batch at a time: under `root`, and in space under `place`.
 
-    def __init__(self, stream: rr.RecordingStream, vehicle: str) -> None:
-        self.stream, self.vehicle = stream, vehicle
-        self.seen = 0
-        self._ticks: queue.SimpleQueue[Tick] = queue.SimpleQueue()
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+    The timeline begins with the first tick of the vehicle that came first; `now` is the time of the newest one.
+    """
+
+    def __init__(
+        self, stream: rr.RecordingStream, vehicle: str, root: str = "", place: str = "space"
+    ) -> None:
+        self.stream, self.vehicle, self.root, self.place = stream, vehicle, root, place
+        self.now = 0.0
         self._trail: deque[tuple[float, tuple[float, float, float]]] = deque()
         self._last: Tick | None = None
-        self._heard = time.monotonic()
+        self._zero: float | None = None
         self._told = ""
-        self._models: dict[str, Any] = {}
-        stream.send_blueprint(blueprint())
-        stream.log("space", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for path, name, colour in CURVES:
             width = 1.0 if "shadow" in path else 2.0
-            stream.log(path, rr.SeriesLines(colors=[colour], names=name, widths=[width]), static=True)
+            stream.log(root + path, rr.SeriesLines(colors=[colour], names=name, widths=[width]), static=True)
         drawn = Vehicle(name=vehicle, mass=1.0, hover_thrust=0.5, rotor_radius=0.07)
-        scene.log_vehicle(stream, "space/vehicle", drawn, 5.0)
+        scene.log_vehicle(stream, f"{place}/vehicle", drawn, 5.0)
 
-    def run(self, link: Link, seconds: float | None = None) -> int:
-        """Follow `link` until told to end or for `seconds`; returns how many ticks were seen."""
-        if link.warning:
-            self.stream.log("events", rr.TextLog(link.warning, level="ERROR"), static=False)
-        link.follow(self._ticks.put, self._events.put, history=HISTORY)
-        end = time.monotonic() + seconds if seconds is not None else np.inf
-        asked = -np.inf
-        with told_to_end() as told:
-            while time.monotonic() < end and not told.wait(PERIOD):
-                if time.monotonic() - asked > ASK and time.monotonic() - self._heard < SILENCE:
-                    asked = time.monotonic()
-                    with contextlib.suppress(InputError):  # the link may drop; ticks say the rest
-                        self._models = link.ask("status", timeout=ASK)
-                        self._models["insecure"] = link.warning
-                self.update()
-        self.update()
-        return self.seen
-
-    def update(self) -> None:
-        """Log what has arrived since the last time."""
-        ticks = [self._ticks.get() for _ in range(self._ticks.qsize())]
-        if ticks:
-            self._heard = time.monotonic()
-            self.add_ticks(ticks)
-        events = [self._events.get() for _ in range(self._events.qsize())]
-        for event in events:
-            self.add_event(event)
-        self._tell()
-
-    def add_ticks(self, ticks: list[Tick]) -> None:
-        """Log ticks, in the order in which they were flown."""
+    def add_ticks(self, ticks: list[Tick], elapsed: float = 0.0) -> None:
+        """Log ticks, in the order in which they were flown; the first ones came when the view was `elapsed` s old."""
         last = self._last.vehicle_time_us if self._last is not None else -1
+        if ticks and max(t.vehicle_time_us for t in ticks) < last:  # its clock began anew
+            last, self._zero, elapsed = -1, None, self.now
+            self._trail.clear()
         ticks = [t for t in sorted(ticks, key=lambda t: t.vehicle_time_us) if t.vehicle_time_us > last]
         if not ticks:
             return
-        self.seen += len(ticks)
-        clock = np.array([t.vehicle_time_us * 1e-6 for t in ticks])
-        times = [rr.TimeColumn(TIME, duration=clock)]
-        for path, values in _columns(ticks).items():
-            self.stream.send_columns(path, indexes=times, columns=rr.Scalars.columns(scalars=values))
-        position = np.array([_xyz(t.position) for t in ticks])
-        turn = np.array([(t.quaternion.x, t.quaternion.y, t.quaternion.z, t.quaternion.w) for t in ticks])
-        self.stream.send_columns(
-            "space/vehicle",
-            indexes=times,
-            columns=rr.Transform3D.columns(translation=position, quaternion=turn),
-        )
-        self._last = ticks[-1]
-        self.stream.set_time(TIME, duration=float(clock[-1]))
+        if self._zero is None:
+            self._zero = 1e-6 * ticks[0].vehicle_time_us - elapsed
+        clock, position = self._send(ticks)
+        self._last, self.now = ticks[-1], float(clock[-1])
+        self.stream.set_time(TIME, duration=self.now)
         self._trail.extend(zip(clock.tolist(), map(tuple, position), strict=True))
         while self._trail and self._trail[0][0] < clock[-1] - TRAIL:
             self._trail.popleft()
         trail = np.array([place for _, place in self._trail])
-        self.stream.log(
-            "space/path", rr.LineStrips3D([trail[:: max(1, len(trail) // 600)]], colors=[NEWEST], radii=0.012)
-        )
+        line = rr.LineStrips3D([trail[:: max(1, len(trail) // 600)]], colors=[NEWEST], radii=0.012)
+        self.stream.log(f"{self.place}/path", line)
         reference = _xyz(self._last.position_reference)
         if self._last.phase not in ("", "idle", "silent") and np.all(np.isfinite(reference)):
-            self.stream.log("space/reference", rr.Points3D([reference], colors=[REFERENCE], radii=0.06))
+            point = rr.Points3D([reference], colors=[REFERENCE], radii=0.06)
+            self.stream.log(f"{self.place}/reference", point)
+
+    def add_past(self, ticks: list[Tick]) -> None:
+        """Log ticks that had been missing."""
+        if self._zero is not None and ticks:
+            self._send(ticks)
+
+    def _send(self, ticks: list[Tick]) -> tuple[np.ndarray, np.ndarray]:
+        """Log the curves and the motion of ticks; their times on the timeline and their positions."""
+        clock = np.array([t.vehicle_time_us * 1e-6 for t in ticks]) - (self._zero or 0.0)
+        times = [rr.TimeColumn(TIME, duration=clock)]
+        for path, values in _columns(ticks).items():
+            self.stream.send_columns(
+                self.root + path, indexes=times, columns=rr.Scalars.columns(scalars=values)
+            )
+        position = np.array([_xyz(t.position) for t in ticks])
+        turn = np.array([(t.quaternion.x, t.quaternion.y, t.quaternion.z, t.quaternion.w) for t in ticks])
+        self.stream.send_columns(
+            f"{self.place}/vehicle",
+            indexes=times,
+            columns=rr.Transform3D.columns(translation=position, quaternion=turn),
+        )
+        return clock, position
 
     def add_event(self, event: Event) -> None:
         """Log an event."""
-        if self._last is not None:
-            self.stream.set_time(TIME, duration=max(event.vehicle_time_us * 1e-6, 0.0))
-        self.stream.log("events", rr.TextLog(f"{event.kind}: {event.text}", level=LEVELS.get(event.level)))
+        if self._zero is not None:
+            self.stream.set_time(TIME, duration=max(event.vehicle_time_us * 1e-6 - self._zero, 0.0))
+        line = f"{event.kind}: {event.text}"
+        self.stream.log(
+            "events",
+            rr.TextLog(line if not self.root else f"{self.vehicle}: {line}", level=LEVELS.get(event.level)),
+        )
 
-    def _tell(self) -> None:
+    def tell(self, silent: float = 0.0, status: dict[str, Any] | None = None) -> None:
         """What the pilot reads first, only when it has changed."""
-        silent = time.monotonic() - self._heard
-        said = state(self.vehicle, self._last, silent if silent > SILENCE else 0.0, self._models)
+        said = state(self.vehicle, self._last, silent, status)
         if said != self._told:
             self._told = said
-            text(self.stream, "state", said)
+            text(self.stream, f"{self.root}state", said)
 
 
 def state(vehicle: str, tick: Tick | None, silent: float, models: dict[str, Any] | None = None) -> str:
@@ -224,8 +249,54 @@ def _bare(about: dict[str, Any]) -> str:
     return str(about.get("title", "")).partition("(")[2].rstrip(")")
 
 
-def blueprint() -> rrb.Blueprint:
-    """What the pilot sees: the vehicle in space and the state large, the rest of it in curves."""
+def blueprint(diagnosed: bool = True) -> rrb.Blueprint:
+    """What the pilot sees of one vehicle: it in space and its state, what a look says of it, the rest in curves."""
+    state_view = rrb.TextDocumentView(origin="state", name="state")
+    left: list[rrb.Container | rrb.View] = [
+        rrb.Horizontal(state_view, _space("vehicle, path (blue), reference (green)"), column_shares=[1, 2.2])
+    ]
+    if diagnosed:
+        left.append(panes("", "diagnosis while it flies"))
+    left.append(_events())
+    shares = [4, 3, 1] if diagnosed else [4, 1]
+    return _page(
+        rrb.Horizontal(
+            rrb.Vertical(*left, row_shares=shares), rrb.Vertical(*_curves("")), column_shares=[5, 4]
+        )
+    )
+
+
+def blueprint_of(vehicles: Sequence[str], diagnosed: bool = True) -> rrb.Blueprint:
+    """What the pilot sees of several: all of them in space, and each with its state, diagnosis and curves."""
+    each = []
+    for name in vehicles:
+        parts: list[rrb.Container | rrb.View] = [rrb.TextDocumentView(origin=f"{name}/state", name=name)]
+        if diagnosed:
+            parts.append(panes(f"{name}/", f"{name}, diagnosis"))
+        curves = rrb.Tabs(*_curves(f"{name}/"), name=f"{name}, curves")
+        shares = [2, 4, 2.5] if diagnosed else [2, 2.5]
+        each.append(rrb.Vertical(*parts, curves, row_shares=shares))
+    space = _space("vehicles, paths (blue), references (green)")
+    left = rrb.Vertical(space, _events(), row_shares=[4, 1])
+    return _page(rrb.Horizontal(left, *each, column_shares=[1.4, *([1] * len(each))]))
+
+
+def _page(content: rrb.Container) -> rrb.Blueprint:
+    panel = rrb.TimePanel(state="collapsed", timeline=TIME, play_state="following")
+    return rrb.Blueprint(content, panel, collapse_panels=True)
+
+
+def _events() -> rrb.TextLogView:
+    columns = rrb.TextLogColumns(timeline_columns=[TIME], text_log_columns=["loglevel", "body"])
+    return rrb.TextLogView(origin="events", name="events, and what changed", columns=columns)
+
+
+def _space(name: str) -> rrb.Spatial3DView:
+    eye = rrb.EyeControls3D(position=(-5.0, -5.0, 4.5), look_target=(0.0, 0.0, 1.2), eye_up=(0.0, 0.0, 1.0))
+    return rrb.Spatial3DView(origin="space", name=name, eye_controls=eye, line_grid=scene.ground())
+
+
+def _curves(root: str) -> list[rrb.Container | rrb.View]:
     now = rrb.VisibleTimeRange(
         TIME,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW),
@@ -234,51 +305,25 @@ def blueprint() -> rrb.Blueprint:
 
     def curves(origin: str, name: str) -> rrb.TimeSeriesView:
         legend = rrb.PlotLegend(visible=False)
-        return rrb.TimeSeriesView(origin=origin, name=name, time_ranges=now, plot_legend=legend)
+        return rrb.TimeSeriesView(origin=root + origin, name=name, time_ranges=now, plot_legend=legend)
 
-    space = rrb.Spatial3DView(
-        origin="space",
-        name="vehicle, path (blue), reference (green)",
-        eye_controls=rrb.EyeControls3D(
-            position=(-5.0, -5.0, 4.5), look_target=(0.0, 0.0, 1.2), eye_up=(0.0, 0.0, 1.0)
-        ),
-        line_grid=scene.ground(),
-    )
-    return rrb.Blueprint(
+    return [
+        curves("position/x", "x (m): flown blue, reference green"),
+        curves("position/y", "y (m)"),
+        curves("position/z", "height z (m)"),
         rrb.Horizontal(
-            rrb.Vertical(
-                rrb.Horizontal(
-                    rrb.TextDocumentView(origin="state", name="state"), space, column_shares=[1, 2.2]
-                ),
-                rrb.TextLogView(
-                    origin="events",
-                    name="events",
-                    columns=rrb.TextLogColumns(
-                        timeline_columns=[TIME], text_log_columns=["loglevel", "body"]
-                    ),
-                ),
-                row_shares=[4, 1],
-            ),
-            rrb.Vertical(
-                curves("position/x", "x (m): flown blue, reference green"),
-                curves("position/y", "y (m)"),
-                curves("position/z", "height z (m)"),
-                rrb.Horizontal(
-                    curves("thrust/feedback", "thrust wanted by the linear cascade (N)"),
-                    curves("thrust/sent", "thrust sent (1 is full)"),
-                ),
-                curves("rates", "body rates sent (deg/s): roll red, pitch green, yaw blue"),
-                curves("correction", "correction (m/s²): x red, y green, z blue; thin: in the shadow"),
-                rrb.Horizontal(
-                    curves("latency", "latency (ms): age grey, model orange"),
-                    curves("battery", "battery (V)"),
-                ),
-            ),
-            column_shares=[5, 4],
+            curves("thrust/feedback", "thrust wanted by the linear cascade (N)"),
+            curves("thrust/sent", "thrust sent (1 is full)"),
+            name="thrust",
         ),
-        rrb.TimePanel(state="collapsed", timeline=TIME, play_state="following"),
-        collapse_panels=True,
-    )
+        curves("rates", "body rates sent (deg/s): roll red, pitch green, yaw blue"),
+        curves("correction", "correction (m/s²): x red, y green, z blue; thin: in the shadow"),
+        rrb.Horizontal(
+            curves("latency", "latency (ms): age grey, model orange"),
+            curves("battery", "battery (V)"),
+            name="latency, battery",
+        ),
+    ]
 
 
 def _columns(ticks: list[Tick]) -> dict[str, np.ndarray]:

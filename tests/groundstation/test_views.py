@@ -82,7 +82,7 @@ def with_monitor(path, flight):
     view.add_event(
         Event(vehicle_time_us=3_000_000, level="warning", kind="guard_trip", text="left the envelope")
     )
-    view.update()
+    view.tell()
     stream.flush()
     stream.disconnect()
 
