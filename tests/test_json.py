@@ -33,6 +33,7 @@ ELSEWHERE = {
     "groundstation deploy": "companion/test_deployment.py",
     "groundstation fly": "groundstation/test_link.py",
     "groundstation status": "groundstation/test_link.py",
+    "groundstation monitor": "groundstation/test_live.py",
     "groundstation survey": "groundstation/test_survey.py",
     "companion check": "companion/test_companion_cli.py",
     "companion doctor": "companion/test_doctor.py",

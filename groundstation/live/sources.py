@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+import zenoh
+
 from trueflight.groundstation.live.window import Hole
 from trueflight.groundstation.operate.link import Link
 from trueflight.models.errors import InputError
@@ -104,7 +106,7 @@ class FromLink:
 
     def _attend(self) -> None:
         while not self._closing.wait(ASK):
-            with contextlib.suppress(InputError):  # the link may be down: ticks say the rest
+            with contextlib.suppress(InputError, zenoh.ZError):  # the link may be down: ticks say the rest
                 self.status = {**self.link.status(), "insecure": self.link.warning}
                 if self.vehicle is None:
                     self._ask_for_vehicle()
