@@ -378,9 +378,9 @@ class _Kept:
         """How many there are."""
         return len(self.messages)
 
-    def add(self, ticks: list[memoryview]) -> None:
-        """Take ticks."""
-        self.messages += map(bytes, ticks)
+    def add(self, data: bytes, spans: list[tuple[int, int]]) -> None:
+        """Take ticks, from a first to before a last byte of `data` each."""
+        self.messages += [data[start:stop] for start, stop in spans]
 
     def settle(self) -> None:
         """Nothing waits here."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,7 +120,8 @@ def flight_of(snapshot: Snapshot) -> Flight:
     taken.
     """
     columns = TickColumns(sum(map(len, snapshot.ticks)))
-    columns.add([memoryview(tick) for tick in snapshot.ticks])
+    ends = [0, *itertools.accumulate(map(len, snapshot.ticks))]
+    columns.add(b"".join(snapshot.ticks), list(itertools.pairwise(ends)))
     columns.settle()
     ticks = columns.columns()
     ticks["t"] = ticks["vehicle_time"] - 1e-6 * snapshot.zero

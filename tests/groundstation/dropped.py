@@ -23,7 +23,7 @@ def dropped_payload(path: Path) -> Path:
     loads = tuple(
         Hidden("payload", {"mass_fraction": share, "time": t}) for share, t in ((0.12, 0.0), (0.0, DROPPED))
     )
-    flown = trajectory("circle", laps=4.0)
+    flown = trajectory("circle", laps=6.0)
     plan = Plan(believed, design, flown, loads, seed=5, rate=50.0, rotor_speeds=False)
     assert record(plan, path).outcome == "finished"
     return path

@@ -262,7 +262,7 @@ def test_a_flight_is_asked_for_watched_fetched_and_tracked(processes, endpoint, 
     assert valid("groundstation status", json.loads(ground("status", "-e", endpoint, "--json")))["ready"]
     # as a shell starts it in the background: Ctrl-C ignored
     watch = subprocess.Popen(
-        ["sh", "-c", f"{program} monitor -e {endpoint} --save {recording} & echo $!; wait"],
+        ["sh", "-c", f"{program} monitor -e {endpoint} --save {recording} --json & echo $!; wait"],
         env=environment,
         stdout=subprocess.PIPE,
         text=True,
@@ -271,13 +271,21 @@ def test_a_flight_is_asked_for_watched_fetched_and_tracked(processes, endpoint, 
     watching = int(watch.stdout.readline())
     flown = json.loads(
         ground(
-            "fly", "hover", "--set", "duration=4", "-e", endpoint, "--wait", "-o", tmp_path / "got", "--json"
+            "fly", "hover", "--set", "duration=10", "-e", endpoint, "--wait", "-o", tmp_path / "got", "--json"
         )
     )
     assert flown["state"] == "finished"
     os.kill(watching, signal.SIGINT)
     told, _ = watch.communicate(timeout=60)
-    assert "ticks seen, written to" in told, told
+    looks = [valid("groundstation monitor", json.loads(line)) for line in told.splitlines()]
+    judged = [one for one in looks if one["kind"] == "look" and not one["error"]]
+    assert judged and not [one for one in looks if one["kind"] == "alert"]
+    assert {e["verdict"] for e in judged[-1]["effects"]} <= {
+        "included",
+        "minor",
+        "not_supported",
+        "not_excited",
+    }
     assert [f.name for f in tmp_path.iterdir() if "live" in f.name] == ["live.rrd"]
     checked = subprocess.run([str(BIN / "rerun"), "rrd", "verify", recording], capture_output=True, text=True)
     assert checked.returncode == 0 and recording.stat().st_size > 10_000, checked.stderr

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -104,9 +105,9 @@ def test_a_hole_that_a_dead_router_left_is_filled_from_the_companions_record(flo
             wait_for(lambda: watch.seen == 200, watch.round)
             first.send_signal(signal.SIGKILL)
             first.wait()
-            send(ticks[200:1300])  # more than the companion keeps for a link that comes back
+            send(ticks[200:1350])  # more than the companion keeps for a link that comes back
             second = router(endpoint)
-            rest = iter(ticks[1300:])
+            rest = iter(ticks[1350:])
 
             def go_on():
                 watch.round()
@@ -143,17 +144,18 @@ def test_two_vehicles_are_watched_at_once(flown, tmp_path):
         arguments += ["-e", end]
     child = subprocess.Popen([program, *arguments], stdout=subprocess.PIPE, text=True, preexec_fn=with_parent)
     try:
-        looked = set()
+        looked: set[str] = set()
         flying = iter(range(len(ticks)))
-        os.set_blocking(child.stdout.fileno(), False)
+        lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+        threading.Thread(target=lambda: [lines.put(x) for x in child.stdout], daemon=True).start()
 
         def step():
             for k in (next(flying, None) for _ in range(2)):
                 if k is not None:
                     for telemetry in served.values():
                         telemetry.tick(ticks[k].SerializeToString())
-            for line in child.stdout.read().splitlines() if child.poll() is None else ():
-                told = valid("groundstation monitor", json.loads(line))
+            for _ in range(lines.qsize()):
+                told = valid("groundstation monitor", json.loads(lines.get()))
                 if told["kind"] == "look" and not told["error"]:
                     looked.add(told["vehicle"])
 
