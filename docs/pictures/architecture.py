@@ -19,10 +19,10 @@ INK, FILL, ARROW, SHORT_CUT = "#1a2b3c", "#e8eef5", "#4a6a8a", "#c8d4e0"
 
 FLOORS = (  # groundstation/, from the top: who may import stands above what is imported; and how far to the right
     (("commands", -2.4), ("library", 2.4)),
-    (("study", -0.6), ("export", 4.6)),
+    (("study", -0.6), ("workbench", 2.0), ("export", 4.6)),
     (("views", -3.6), ("report", 1.6)),
     (("output", -1.2),),
-    (("versions", -3.4), ("learn", 2.6)),
+    (("versions", -3.4), ("live", 0.2), ("learn", 2.6)),
     (("evaluate", -0.2),),
     (("identify", -1.7),),
     (("reading", -4.6), ("measured", -2.3), ("design", 0.0), ("results", 2.3), ("operate", 4.6)),
