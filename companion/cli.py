@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import sys
-import threading
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -18,9 +13,6 @@ from trueflight.models.errors import InputError, run_command_line
 from trueflight.models.printed import print_json_line
 from trueflight.models.program import offer_version
 
-if TYPE_CHECKING:
-    from trueflight.companion.app import Companion
-
 app = typer.Typer(
     name="companion",
     help="Runs on the vehicle: flies missions over MAVLink, records them, and answers the ground over Zenoh.",
@@ -28,8 +20,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
-
-_CLOSE_PATIENCE = 5.0  # s
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Connect = Annotated[
@@ -91,10 +81,8 @@ def run(
     land, falls silent once that has taken over, closes the record and exits; a second signal ends it at once,
     and then the autopilot's offboard-loss failsafe is what lands the vehicle.
     """
-    from trueflight.companion.app import Companion
-    from trueflight.companion.settings import load_settings
+    from trueflight.companion.flying import fly_instead, request
 
-    settings = load_settings(config)
     given: dict[str, Any] = {
         "vehicle": vehicle,
         "design": design,
@@ -118,46 +106,12 @@ def run(
     flags: dict[str, Any] = {
         name: value if isinstance(value, (int, float)) else str(value) for name, value in _set(given).items()
     }
-    settings = replace(settings, **flags, zenoh=replace(settings.zenoh, **_set(zenoh)))
-    _serve(Companion(settings), settings.connect)
+    fly_instead(request(str(config) if config is not None else "", flags, _set(zenoh)))
 
 
 def _set(flags: dict[str, Any]) -> dict[str, Any]:
     """Those that were given."""
     return {name: value for name, value in flags.items() if value is not None}
-
-
-def _serve(companion: Companion, address: str) -> None:
-    """Tell that it is ready, fly until a signal, and end even where the control thread hangs."""
-    from trueflight.companion.zenoh_session import INSECURE
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        if companion.director.stopping.is_set():
-            os._exit(128 + number)
-        companion.stop()
-
-    signal.signal(signal.SIGINT, stop)
-    signal.signal(signal.SIGTERM, stop)
-    rates = companion.readiness.rates
-    assert rates is not None
-    if companion.access["exposed"]:
-        from rich.console import Console
-
-        Console(stderr=True).print(f"[bold red]{INSECURE}[/]; it {' and '.join(companion.access['exposed'])}")
-    where = ", ".join(companion.access["listen"]) or "Zenoh"
-    ready = f"{companion.vehicle.name} at {rates.odometry:.0f} Hz on {address}, missions on {where}"
-    typer.echo(f"ready: {ready}")
-    sys.stdout.flush()
-    companion.watchdog.ready(ready)
-    try:
-        companion.run()
-    finally:
-        # MAVSDK waits for its callbacks; a control thread that hangs would keep us here for ever.
-        closing = threading.Thread(target=companion.close, daemon=True)
-        closing.start()
-        closing.join(_CLOSE_PATIENCE)
-        if closing.is_alive():
-            os._exit(1)
 
 
 @app.command(epilog="Example: companion check --connect udpin://127.0.0.1:14540 --json")

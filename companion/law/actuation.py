@@ -108,7 +108,7 @@ class RateModel:
         before = after = next(moments)
         while after[0] < then:  # ends: the newest is now
             before, after = after, next(moments)
-        part = (then - before[0]) / (after[0] - before[0]) if after is not before else 1.0
+        part = (then - before[0]) / (after[0] - before[0]) if after[0] > before[0] else 1.0
         angle, rate = _between(before[1], after[1], part), _between(before[2], after[2], part)
         (x, y), (p, q) = self._angle, self._rate
         return (x - angle[0], y - angle[1]), (p - rate[0], q - rate[1])

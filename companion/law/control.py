@@ -248,8 +248,11 @@ class ControlLaw:
         tilt = math.hypot(roll, pitch)
         if tilt > self.limits.tilt:  # keep the direction: a clipped axis would push the vehicle off its line
             roll, pitch = roll * self.limits.tilt / tilt, pitch * self.limits.tilt / tilt
-        return Attitude(roll, pitch, min(self._thrust_high, max(self._thrust_low, thrust)))
+        low, high = self._thrust_low, self._thrust_high
+        if not low <= thrust <= high:  # true for NaN as well: the least thrust then
+            thrust = high if thrust > high else low
+        return Attitude(roll, pitch, thrust)
 
 
 def _clip(value: float, limit: float) -> float:
-    return min(limit, max(-limit, value))
+    return value if -limit <= value <= limit else limit if value > limit else -limit  # -limit for NaN

@@ -209,7 +209,7 @@ def _one_by_one(
 
 
 def _within(value: float, authority: float) -> float:
-    return min(authority, max(-authority, value))
+    return value if -authority <= value <= authority else authority if value > authority else -authority
 
 
 def margin(feature: Range, share: float) -> float:

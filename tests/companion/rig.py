@@ -208,7 +208,10 @@ class Companion(Process):
             config.write_text(settings)
             flags = (*flags, "--config", str(config))
         self.zenoh_port = free_port(socket.SOCK_STREAM)
-        program = f"{before}\nfrom trueflight.companion.cli import main; main()"
+        program = "from trueflight.companion.cli import main; main()"
+        if before:  # what is to be different must not end where the flying process begins
+            here = "from trueflight.companion import flying; flying.fly_instead = flying.fly"
+            program = f"{before}\n{here}\n{program}"
         super().__init__(
             [
                 "-c",

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 from json_schemas import valid
-from rig import VEHICLE, Bridge, free_port
+from onnx_models import drag_model
+from rig import VEHICLE, Bridge, Companion, free_port
 
 from trueflight.companion.settings import Settings, load_settings
+from trueflight.models.contract import model_hash
 from trueflight.models.errors import InputError
 
 pytestmark = pytest.mark.realtime
@@ -69,6 +71,45 @@ def test_check_tells_what_arrives(bridge: tuple[Bridge, int]) -> None:
     assert report["parameters"]["COM_OBL_RC_ACT"] == 0
     assert report["flight_mode"] == "HOLD"
     assert not report["armed"]
+
+
+LEFT_OUT = (
+    "typer",
+    "rich",
+    "onnxruntime",
+    "cryptography",
+    "torch",
+    "scipy",
+    "onnx",
+    "trueflight.companion.cli",
+)
+
+
+def test_the_process_that_flies_has_loaded_nothing_that_it_does_not_fly_with(
+    bridge: tuple[Bridge, int], tmp_path: Path
+) -> None:
+    """Python itself tells what it imports; the flying process begins with the last headline of that."""
+    (tmp_path / "models").mkdir()
+    onnx = drag_model(0.05)
+    (tmp_path / "models" / f"{model_hash(onnx)}.onnx").write_bytes(onnx)
+    (tmp_path / "models" / "history.json").write_text(json.dumps([model_hash(onnx)]))
+    companion = Companion(tmp_path, bridge[1], environment={"PYTHONPROFILEIMPORTTIME": "1"})
+    try:
+        mission = companion.fly(trajectory="hover", parameters={"duration": 1.0}, controller="corrected")
+        companion.phase("mission")
+        assert companion.ticks[-1].model == model_hash(onnx)
+        companion.ask("mission", {"command": "land"})
+        companion.done(mission)
+    finally:
+        companion.end()
+    imported = [
+        line.rpartition("|")[2].strip() for line in companion.lines if line.startswith("import time:")
+    ]
+    flying = imported[len(imported) - imported[::-1].index("imported package") :]
+    assert "trueflight.companion.app" in flying and "trueflight.companion.law.straight_line" in flying
+    assert not [
+        name for name in flying if name in LEFT_OUT or name.startswith(tuple(f"{one}." for one in LEFT_OUT))
+    ]
 
 
 def test_too_low_a_rate_is_refused(bridge: tuple[Bridge, int], tmp_path: Path) -> None:
