@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import threading
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -92,7 +93,14 @@ class _Bounded:
         return data
 
 
-_ZSTD = zstandard.ZstdDecompressor()
+class _Of(threading.local):
+    """One decompressor for each thread: no two may use one, and it takes as long to make as a chunk to unpack."""
+
+    def __init__(self) -> None:
+        self.zstd = zstandard.ZstdDecompressor()
+
+
+_OF_THREAD = _Of()
 
 
 def _unpacked(chunk: Chunk) -> Chunk:
@@ -104,7 +112,7 @@ def _unpacked(chunk: Chunk) -> Chunk:
         claimed = zstandard.get_frame_parameters(chunk.data).content_size
         if claimed not in (zstandard.CONTENTSIZE_UNKNOWN, size):
             raise ValueError(f"a chunk claims {size} bytes and {claimed}")
-        data = _ZSTD.decompress(chunk.data, size)
+        data = _OF_THREAD.zstd.decompress(chunk.data, size)
     elif chunk.compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
     else:

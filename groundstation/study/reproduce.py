@@ -8,6 +8,8 @@ expected linear behaviour, as in Table I of Carvalho et al., ICUAS 2022.
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -298,19 +300,60 @@ def fly_all(
     jobs: int,
     advance: Callable[[], None],
 ) -> list[Flown]:
-    """Every scenario with every controller, in-process; flights that are in `folder` already are not flown again."""
+    """Every scenario with every controller, in-process and all at once; flights that are in `folder` already are not
+    flown again."""
     arms = [(scenario, arm) for scenario in scenarios for arm in ARMS]
     arms += [(scenarios[0], arm) for arm in ANATOMY[:2]]
+    known = {_stem(*task): _known(folder / _stem(*task)) for task in arms}
+    missing = [task for task in arms if known[_stem(*task)] is None]
+    reports: dict[str, dict[str, Any]] = {}
+    if missing:
+        for task in missing:  # of a run that was killed before it could tell
+            (folder / f"{_stem(*task)}.mcap").unlink(missing_ok=True)
+        table = folder / "flights.csv"
+        write_whole(table, table_of(prepared, truth, missing), "the table of flights")
+        words: list[object] = ["sim-bridge", "fly-many", "--flights", table, "--vehicle", vehicle]
+        words += ["--seed", prepared.seed, "--settle", SETTLE, "--jobs", jobs, "-o", folder, "--json"]
+        reports = {report["name"]: report for report in run_json(words)["flights"]}
+        table.unlink()
 
     def one(task: tuple[Scenario, Arm]) -> Flown:
         scenario, arm = task
         stem = _stem(scenario, arm)
-        flown = _kept(folder / stem, partial(_fly, vehicle, prepared, truth, scenario, arm))
+        flown = known[stem] or _kept(
+            folder / stem, lambda _: _judged(folder, prepared, scenario, arm, reports[stem])
+        )
         advance()
         return flown
 
     with ThreadPoolExecutor(jobs) as pool:
         return list(pool.map(one, arms))
+
+
+def table_of(prepared: Prepared, truth: Sequence[str], tasks: Sequence[tuple[Scenario, Arm]]) -> str:
+    """The CSV that `sim-bridge fly-many --flights` reads."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(
+        ["name", "trajectory", "set", "hidden", "charge", "battery_age", "controller", "model", "trim"]
+    )
+    for scenario, arm in tasks:
+        settings = (f"{key}={value:g}" for key, value in scenario.settings(prepared.seed).items())
+        words = [*truth, *scenario.truth]
+        told = list(zip(words[::2], words[1::2], strict=True))
+        model = (
+            prepared.files[arm.model + ("" if arm.look_ahead else " at once")].resolve() if arm.model else ""
+        )
+        writer.writerow(
+            [_stem(scenario, arm), scenario.trajectory, ";".join(settings)]
+            + [";".join(value for option, value in told if option == "--hidden")]
+            + [
+                next((value for option, value in told if option == name), "")
+                for name in ("--charge", "--battery-age")
+            ]
+            + [arm.controller, model, "" if arm.trim is None else arm.trim]
+        )
+    return out.getvalue()
 
 
 def _stem(scenario: Scenario, arm: Arm) -> str:
@@ -319,18 +362,20 @@ def _stem(scenario: Scenario, arm: Arm) -> str:
 
 def _kept(path: Path, fly: Callable[[Path], Flown]) -> Flown:
     """What is known of the flight at `path` (without suffix), flown now where nothing is."""
-    kept = path.with_name(f"{path.name}.json")
+    if (known := _known(path)) is not None:
+        return known
+    flown = fly(path)
+    write_whole(path.with_name(f"{path.name}.json"), json.dumps(asdict(flown)), "what was flown")
+    return flown
+
+
+def _known(path: Path) -> Flown | None:
+    """What an earlier run kept of the flight at `path` (without suffix)."""
     kinds = {
         "seed": int, "scenario": str, "controller": str, "mse": list, "outcome": str, "guard": str, "through": str,
     }  # fmt: skip
-    if (table := _told(kept, kinds)) is not None:
-        return Flown(**{**table, "mse": tuple(table["mse"])})
-    path.with_name(f"{path.name}.mcap").unlink(
-        missing_ok=True
-    )  # of a run that was killed before it could tell
-    flown = fly(path)
-    write_whole(kept, json.dumps(asdict(flown)), "what was flown")
-    return flown
+    table = _told(path.with_name(f"{path.name}.json"), kinds)
+    return None if table is None else Flown(**{**table, "mse": tuple(table["mse"])})
 
 
 def _told(kept: Path, kinds: dict[str, type]) -> dict[str, Any] | None:
@@ -345,23 +390,9 @@ def _told(kept: Path, kinds: dict[str, type]) -> dict[str, Any] | None:
     return table if whole else None
 
 
-def _fly(
-    vehicle: Path, prepared: Prepared, truth: Sequence[str], scenario: Scenario, arm: Arm, path: Path
-) -> Flown:
-    record = path.with_name(f"{path.name}.mcap")
-    command: list[object] = ["sim-bridge", "fly", "--trajectory", scenario.trajectory, "--vehicle", vehicle]
-    for key, value in scenario.settings(prepared.seed).items():
-        command += ["--set", f"{key}={value:g}"]
-    command += [*truth, "--seed", prepared.seed, *scenario.truth, "--settle", SETTLE]
-    command += ["--controller", arm.controller]
-    if arm.model:
-        command += ["--model", prepared.files[arm.model + ("" if arm.look_ahead else " at once")]]
-    if arm.trim is not None:
-        command += ["--trim", arm.trim]
-    report = run_json([*command, "-o", record, "--json"])
-    return Flown(
-        prepared.seed, scenario.name, arm.name, track_file(record).mse, report["outcome"], report["guard"]
-    )
+def _judged(folder: Path, prepared: Prepared, scenario: Scenario, arm: Arm, report: dict[str, Any]) -> Flown:
+    mse = track_file(folder / f"{_stem(scenario, arm)}.mcap").mse
+    return Flown(prepared.seed, scenario.name, arm.name, mse, report["outcome"], report["guard"])
 
 
 def fly_companion(

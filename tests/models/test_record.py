@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,18 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert ticks["setpoint_sent"].all()
     # Columns of a flight that a record can hold are named as there; motor commands stay inside the autopilot.
     assert set(COLUMNS) - set(ticks) == {"motor_command", "position_reference"}
+
+
+def test_several_threads_read_each_their_own(tmp_path: Path) -> None:
+    for i in range(4):
+        write(tmp_path / f"{i}.mcap", 1500 + 300 * i)
+    paths = 6 * sorted(tmp_path.glob("*.mcap"))
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(read_record, paths))
+    for path, record in zip(paths, together, strict=True):
+        alone = read_record(path)
+        assert not record.truncated
+        np.testing.assert_array_equal(record.ticks["position"], alone.ticks["position"])
 
 
 def test_a_model_in_the_shadow_is_recorded_beside_the_live_one(tmp_path: Path) -> None:
