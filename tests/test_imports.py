@@ -233,6 +233,35 @@ def test_the_programs_help_loads_no_command() -> None:
     assert not loaded & {"numpy", "pydantic", "trueflight.models.flight"}
 
 
+SAMPLE = "samples/rotorpy/nothing_hidden/identify.parquet"
+NEVER = {
+    "torch",
+    "control",
+    "pandas",
+    "scipy.stats",
+    "scipy.signal",
+    "statsmodels",
+    "onnx",
+    "zenoh",
+    "dask",
+    "sympy",
+}
+"""What no flight is read, compared or diagnosed with."""
+DRAWING = {"matplotlib", "rerun"}
+
+
+@pytest.mark.parametrize("command", ["diagnose", "compare"])
+def test_what_cannot_be_read_is_told_before_anything_dear_is_loaded(command: str) -> None:
+    assert not loaded_by(command, "nothing.csv") & {*NEVER, *DRAWING, "scipy", "pyarrow", "google.protobuf"}
+
+
+def test_a_flight_is_diagnosed_and_compared_with_what_that_needs_alone(tmp_path: Path) -> None:
+    assert not loaded_by("diagnose", SAMPLE) & {*NEVER, *DRAWING}
+    assert not loaded_by("compare", SAMPLE) & {*NEVER, *DRAWING}
+    drawn = loaded_by("compare", SAMPLE, "--save", str(tmp_path / "compare.rrd"))
+    assert "rerun" in drawn and not drawn & {"torch", "control", "scipy.stats", "onnx", "zenoh"}
+
+
 def test_a_diagnosis_begins_without_what_it_may_not_need() -> None:
     import subprocess
 

@@ -12,6 +12,7 @@ from trueflight import __version__
 from trueflight.groundstation.commands.app import app
 from trueflight.groundstation.commands.tasks import TASKS
 
+FLIGHT = Path(__file__).parents[1] / "samples" / "rotorpy" / "nothing_hidden" / "identify.parquet"
 BIN = Path(sys.executable).parent
 WITHOUT = """
 import sys
@@ -45,7 +46,7 @@ def test_every_command_stands_under_a_task_with_its_own_words() -> None:
 
 def test_in_the_companions_environment_it_says_what_to_install() -> None:
     told = subprocess.run(
-        [sys.executable, "-c", WITHOUT, "diagnose", "flight.csv"], capture_output=True, text=True
+        [sys.executable, "-c", WITHOUT, "diagnose", str(FLIGHT)], capture_output=True, text=True
     )
     assert told.returncode == 2
     assert told.stderr == "error: scipy is not installed here; pip install 'trueflight[ground]'\n"

@@ -62,10 +62,13 @@ def compare_command(
     Example: groundstation compare before.csv after.csv --save compare.rrd -o compare.html
     """
     from trueflight.groundstation.reading.several import read_together
+
+    read = read_together(flights, vehicle, mapping)
+
+    # dear to load, and what cannot be read is told without it
     from trueflight.groundstation.versions.choice import choose_model
     from trueflight.groundstation.versions.store import lineage
 
-    read = read_together(flights, vehicle, mapping)
     models = [[choose_model(f, which, store, effects) for which in model or (None,)] for f in read]
     if len(read) > 1 or len(models[0]) > 1:
         _side_by_side(read, models, bandwidth, save, output, as_json)
@@ -87,14 +90,16 @@ def _one_flight(
     from trueflight.groundstation.evaluate.where import where_it_fails
     from trueflight.groundstation.output.as_json import beside_table, comparison_table, where_table
     from trueflight.groundstation.output.tables import print_comparisons, print_where
-    from trueflight.groundstation.report import render_side_by_side, write_report
-    from trueflight.groundstation.views import write_comparison
 
     results = [compare(flight, m, bandwidth) for m in line]
     where = where_it_fails(results[-1])
     if save is not None:
+        from trueflight.groundstation.views import write_comparison
+
         write_comparison(save, results, where)
     if output is not None:
+        from trueflight.groundstation.report import render_side_by_side, write_report
+
         beside = side_by_side([flight], [line], bandwidth)
         write_report(output, render_side_by_side(beside, beside_table(beside)))
     if as_json:
@@ -124,15 +129,17 @@ def _side_by_side(
     from trueflight.groundstation.evaluate.side_by_side import side_by_side
     from trueflight.groundstation.output.as_json import beside_table
     from trueflight.groundstation.output.tables import print_side_by_side
-    from trueflight.groundstation.report import render_side_by_side, write_report
-    from trueflight.groundstation.views import write_side_by_side
 
     with working(console, "comparing", as_json):
         beside = side_by_side(flights, models, bandwidth)
         table = beside_table(beside)
         if save is not None:
+            from trueflight.groundstation.views import write_side_by_side
+
             write_side_by_side(save, beside)
         if output is not None:
+            from trueflight.groundstation.report import render_side_by_side, write_report
+
             write_report(output, render_side_by_side(beside, table))
     if as_json:
         print_json({**table, **_written(save, output)})

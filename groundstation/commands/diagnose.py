@@ -72,22 +72,25 @@ def diagnose_command(
 
     Example: groundstation diagnose identify.csv --vehicle vehicle.toml --validate validate.csv --save analysis.rrd
     """
-    from trueflight.groundstation.evaluate.analysis import gather
-    from trueflight.groundstation.identify.flights import diagnose_flights
-    from trueflight.groundstation.identify.rotors import thrust_from_rotors
-    from trueflight.groundstation.output.as_json import analysis_table
-    from trueflight.groundstation.output.ranking import print_diagnosis
     from trueflight.groundstation.reading.several import read_held_out, read_together
-    from trueflight.groundstation.versions.choice import choose_design, choose_line
 
     if thrust not in ("command", "rotors"):
         raise InputError(f"--thrust {thrust}: choose command or rotors")
     flights = read_together(flight, vehicle, mapping)
     held_out = None if validate is None else read_held_out(validate, flights[0], vehicle, mapping)
+    well = [read_held_out(path, flights[0], vehicle, mapping) for path in healthy or ()]
+
+    # dear to load, and what cannot be read is told without it
+    from trueflight.groundstation.evaluate.analysis import gather
+    from trueflight.groundstation.identify.flights import diagnose_flights
+    from trueflight.groundstation.identify.rotors import thrust_from_rotors
+    from trueflight.groundstation.output.as_json import analysis_table
+    from trueflight.groundstation.output.ranking import print_diagnosis
+    from trueflight.groundstation.versions.choice import choose_design, choose_line
+
     if thrust == "rotors":
         flights = [thrust_from_rotors(one) for one in flights]
         held_out = None if held_out is None else thrust_from_rotors(held_out)
-    well = [read_held_out(path, flights[0], vehicle, mapping) for path in healthy or ()]
     line = choose_line(flights[0], model, store, effects)
     with working(console, "looking for missing effects", as_json) as progress:
         found = diagnose_flights(

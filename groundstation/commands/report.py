@@ -68,20 +68,23 @@ def report_command(
     last of them, and all are compared side by side. Sections: ranking, flights, waterfall, prediction, where, worst,
     tracking, side_by_side, blind, provenance.
     """
-    from trueflight.groundstation.evaluate.analysis import gather
-    from trueflight.groundstation.evaluate.side_by_side import side_by_side
-    from trueflight.groundstation.identify.flights import diagnose_flights
-    from trueflight.groundstation.output.as_json import analysis_table
-    from trueflight.groundstation.output.ranking import print_diagnosis
     from trueflight.groundstation.reading.several import read_beside, read_held_out, read_together, told_apart
     from trueflight.groundstation.report import chosen, render, write_report
-    from trueflight.groundstation.versions.choice import choose_design, choose_line, choose_model
 
     sections = chosen(without or ())
     together = read_together(flight, vehicle, mapping)
     read = together[-1]
     held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
     flights = told_apart([*together, *(read_beside(path, read, vehicle, mapping) for path in beside or ())])
+
+    # dear to load, and what cannot be read is told without it
+    from trueflight.groundstation.evaluate.analysis import gather
+    from trueflight.groundstation.evaluate.side_by_side import side_by_side
+    from trueflight.groundstation.identify.flights import diagnose_flights
+    from trueflight.groundstation.output.as_json import analysis_table
+    from trueflight.groundstation.output.ranking import print_diagnosis
+    from trueflight.groundstation.versions.choice import choose_design, choose_line, choose_model
+
     named = [[choose_model(f, which, store, effects) for which in model or (None,)] for f in flights]
     line = choose_line(read, model[-1] if model else None, store, effects)
     with working(console, "comparing", as_json) as progress:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from trueflight.groundstation.identify.fitting import (
     SCALE,
@@ -83,7 +83,7 @@ def _asked(
     shared = residual + together @ settled
     unit = max(variance_per_independent_sample(problem, left.reshape(here.residual.shape)), problem.unit())
     ratio = max(float(shared @ shared - left @ left) / unit, 0.0)
-    p_value = float(stats.chi2.sf(ratio, count - 1))
+    p_value = float(special.chdtrc(count - 1, ratio))
     size = value + step[len(others) :]
     covariance = unit * inverse[len(others) :, len(others) :]
     # what sensors and clocks of each flight are granted is no difference of the vehicle
@@ -159,7 +159,7 @@ def agreeing(size: np.ndarray, covariance: np.ndarray, alpha: float) -> tuple[in
     do; one alone where no two do."""
     among = list(range(len(size)))
     while len(among) > 1:
-        if stats.chi2.sf(_disagreement(size, covariance, among), len(among) - 1) >= alpha:
+        if special.chdtrc(len(among) - 1, _disagreement(size, covariance, among)) >= alpha:
             break
         without = {k: [j for j in among if j != k] for k in among}
         among = min(without.values(), key=lambda rest: _disagreement(size, covariance, rest))

@@ -209,7 +209,7 @@ def _read_parquet(path: Path) -> Table:
             raise InputError(
                 f"{path}: claims {about.num_rows} rows of {about.num_columns} columns; export it again"
             )
-        arrow = arrow_parquet.read_table(path)
+        arrow = arrow_parquet.ParquetFile(path).read()  # read_table() loads pandas
         return Table(str(path), _numbers(str(path), arrow, None), (), None, (), tuple(_text_columns(arrow)))
 
 
@@ -231,16 +231,29 @@ def _numbers(origin: str, arrow: object, first_line: int | None) -> dict[str, np
             or pa.types.is_boolean(column.type)
         ):
             continue
-        as_float = (
-            column.cast(pa.float64()) if not pa.types.is_boolean(column.type) else column.cast(pa.int8())
-        )
         clean = name.strip().lstrip("#").strip()
-        columns[clean] = np.array(as_float.to_numpy(zero_copy_only=False), dtype=float)
+        columns[clean] = _floats(column if not pa.types.is_boolean(column.type) else column.cast(pa.int8()))
     if not columns or len(next(iter(columns.values()))) == 0:
         raise InputError(
             f"{origin}: no rows of numbers in it; a header line and one row for each sample are needed"
         )
     return columns
+
+
+def _floats(column: Any) -> np.ndarray:
+    """Numbers (N,) of a column, NaN where one is missing; from its buffers, for `to_numpy` of pyarrow loads pandas."""
+    import pyarrow as pa
+
+    pieces = [np.empty(0)]
+    for chunk in column.cast(pa.float64()).chunks:
+        known, values = chunk.buffers()
+        rows = slice(chunk.offset, chunk.offset + len(chunk))
+        piece = np.frombuffer(values, float, rows.stop)[rows] if len(chunk) else np.empty(0)
+        if chunk.null_count:
+            bits = np.unpackbits(np.frombuffer(known, np.uint8), count=rows.stop, bitorder="little")
+            piece = np.where(bits[rows] == 1, piece, np.nan)
+        pieces.append(piece)
+    return np.concatenate(pieces)
 
 
 def _seconds(column: Any) -> np.ndarray:
