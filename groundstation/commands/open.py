@@ -44,6 +44,13 @@ def open_command(
         "trueflight-workbench"
     ),
     port: Annotated[int, typer.Option(help="0: a free one.", min=0, max=65535)] = 0,
+    host: Annotated[
+        str, typer.Option(help="Serve other machines under this name or address; only with --keys.")
+    ] = "127.0.0.1",
+    keys: Annotated[
+        Path | None,
+        typer.Option(help="Folder of `groundstation keys`, with its authority: who may open the page."),
+    ] = None,
     most: Annotated[float, typer.Option(help="MB of a dropped file at most.", min=0.001)] = 2048.0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")] = True,
 ) -> None:
@@ -64,7 +71,7 @@ def open_command(
     opened = _opened(flights or [], vehicle)
     held_out = None if validate is None else _opened([validate], vehicle)[0]
     with suppress(KeyboardInterrupt):  # how it is ended
-        serve(Serving(folder, store, opened, held_out, port, int(1e6 * most)), ready)
+        serve(Serving(folder, store, opened, held_out, port, int(1e6 * most), host, keys), ready)
 
 
 def _opened(paths: list[Path], vehicle: Path | None) -> tuple[Source, ...]:

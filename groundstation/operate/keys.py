@@ -10,6 +10,7 @@ What a folder holds is told in `models.access`. Private keys have mode 0600, the
 from __future__ import annotations
 
 import datetime as dt
+import ipaddress
 import json
 import os
 import shutil
@@ -34,6 +35,8 @@ _AUTHORITY_DAYS = 3650
 _EARLY = dt.timedelta(days=2)
 """By how much certificates begin in the past: a vehicle without a clock of its own is behind."""
 _ISSUED = "issued.json"
+_PAGE = "workbench.page"
+_PAGE_LASTS = dt.timedelta(days=7)
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,22 @@ def make_keys(
     except OSError as error:
         raise InputError(f"{error.filename or root}: cannot write it ({error.strerror})") from None
     return Made(root, new_authority, tuple(made), tuple(changed), tuple(removed), until)
+
+
+def make_page_keys(root: Path, names: Sequence[str], folder: Path) -> frozenset[str]:
+    """Certificate and key, for a week, of a page that this machine serves under `names` (host names or addresses), in
+    the new folder `folder`. Returns the names in the certificates of the people who are let in.
+
+    Raises `InputError` where `root` is no folder of `groundstation keys` with its authority.
+    """
+    authority = _Authority(root / "ca")
+    issued = _issued(root)
+    now = dt.datetime.now(dt.UTC)
+    with _folder(folder) as place:
+        authority.serve_as(place, names, now, now + _PAGE_LASTS)
+    return frozenset(
+        about["certificate"] for about in issued.values() if about["in"] and about["role"] in access.ROLES
+    )
 
 
 def next_steps(made: Made) -> list[str]:
@@ -295,22 +314,9 @@ class _Authority:
         vehicle = entry["role"] == access.VEHICLE
         key = ec.generate_private_key(ec.SECP256R1())
         # Only a vehicle may serve: an operator's certificate cannot stand in for one.
-        uses = [ExtendedKeyUsageOID.SERVER_AUTH] if vehicle else [ExtendedKeyUsageOID.CLIENT_AUTH]
-        certificate = (
-            x509.CertificateBuilder()
-            .subject_name(_named(entry["certificate"]))
-            .issuer_name(self._certificate.subject)
-            .public_key(key.public_key())
-            .serial_number(x509.random_serial_number())
-            .not_valid_before(min(now - _EARLY, until - _EARLY))
-            .not_valid_after(min(until, self._certificate.not_valid_after_utc))
-            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(_usage(signs=False), critical=True)
-            .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
-            .add_extension(
-                x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False
-            )
-            .sign(self._key, hashes.SHA256())
+        use = ExtendedKeyUsageOID.SERVER_AUTH if vehicle else ExtendedKeyUsageOID.CLIENT_AUTH
+        certificate = self._certified(key, entry["certificate"], use, now, until).sign(
+            self._key, hashes.SHA256()
         )
         _write(folder / access.AUTHORITY, self._pem, 0o644)
         _write(folder / access.CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
@@ -319,3 +325,44 @@ class _Authority:
             signing = Ed25519PrivateKey.generate()
             _write(folder / access.SIGNING_KEY, _private(signing))
             entry["signing_key"] = signing.public_key().public_bytes_raw().hex()
+
+    def serve_as(self, folder: Path, names: Sequence[str], now: dt.datetime, until: dt.datetime) -> None:
+        """Write the certificate and key of a page that is served under `names` into `folder`."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        builder = self._certified(key, _PAGE, ExtendedKeyUsageOID.SERVER_AUTH, now, until)
+        alternatives = x509.SubjectAlternativeName([_alternative(name) for name in names])
+        certificate = builder.add_extension(alternatives, critical=False).sign(self._key, hashes.SHA256())
+        _write(folder / access.AUTHORITY, self._pem, 0o644)
+        _write(folder / access.CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+        _write(folder / access.PRIVATE_KEY, _private(key))
+
+    def _certified(
+        self,
+        key: ec.EllipticCurvePrivateKey,
+        name: str,
+        use: x509.ObjectIdentifier,
+        now: dt.datetime,
+        until: dt.datetime,
+    ) -> x509.CertificateBuilder:
+        return (
+            x509.CertificateBuilder()
+            .subject_name(_named(name))
+            .issuer_name(self._certificate.subject)
+            .public_key(key.public_key())
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(min(now - _EARLY, until - _EARLY))
+            .not_valid_after(min(until, self._certificate.not_valid_after_utc))
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(signs=False), critical=True)
+            .add_extension(x509.ExtendedKeyUsage([use]), critical=False)
+            .add_extension(
+                x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False
+            )
+        )
+
+
+def _alternative(name: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        return x509.DNSName(name)

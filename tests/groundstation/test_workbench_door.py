@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import re
+import ssl
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 from processes import with_parent
 
+from trueflight.groundstation.operate.keys import make_keys
 from trueflight.groundstation.workbench.quantities import in_unit
 from trueflight.groundstation.workbench.uploads import Dropped, beside, ending, shown_name
 from trueflight.groundstation.workbench.vehicle_form import drafted_form, filled, form_of, write_vehicle
@@ -183,6 +185,40 @@ def test_a_filled_form_is_the_vehicle_and_each_problem_stands_at_its_field(tmp_p
 def test_a_flight_without_a_log_of_an_autopilot_gets_a_form_of_guesses(tmp_path: Path) -> None:
     form = drafted_form(tmp_path / "flight.csv")
     assert {f.key for f in form if not f.measured} == {"name", "mass", "hover_thrust"}
+
+
+def test_other_machines_are_served_with_keys_alone_and_nobody_without_one_is_let_in(tmp_path: Path) -> None:
+    keys = tmp_path / "keys"
+    make_keys(keys, people=[("anna", "engineer"), ("carl", "operator")])
+    make_keys(keys, removed=["carl"])
+    program = Path(sys.executable).with_name("groundstation")
+    words = [program, "open", "--no-browser", "--host", "127.0.0.2"]
+    refused = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert "only with keys" in refused.stderr
+    process = subprocess.Popen(
+        [*words, "--keys", keys], cwd=tmp_path, stdout=subprocess.PIPE, text=True, preexec_fn=with_parent
+    )
+    try:
+        assert process.stdout is not None
+        link = re.search(r"https://127\.0\.0\.2:(\d+)(/\?token=\S+)", process.stdout.readline())
+        assert link is not None
+
+        def opened_by(person: str) -> int:
+            context = ssl.create_default_context(cafile=str(keys / "ca" / "ca.pem"))
+            if person:
+                context.load_cert_chain(keys / person / "cert.pem", keys / person / "key.pem")
+            connection = http.client.HTTPSConnection("127.0.0.2", int(link[1]), context=context)
+            connection.request("GET", link[2])
+            return connection.getresponse().status
+
+        assert opened_by("anna") == 303
+        for person in ("carl", ""):
+            with pytest.raises(OSError):
+                opened_by(person)
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def test_files_dropped_together_find_each_other_by_their_names() -> None:
