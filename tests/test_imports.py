@@ -57,7 +57,7 @@ ROOMS: dict[str, set[str]] = {
         "report", "export",
     },
     "workbench": {
-        "results", "reading", "identify", "evaluate", "versions", "output", "views", "report", "operate",
+        "results", "reading", "design", "identify", "evaluate", "versions", "output", "views", "report", "operate",
     },
     "commands": {
         "results", "reading", "measured", "design", "operate", "identify", "evaluate", "learn", "versions", "output",

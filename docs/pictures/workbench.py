@@ -60,7 +60,7 @@ def idle(page: Page) -> None:
     page.wait_for_timeout(700)
 
 
-def at(page: Page, panel: str, above: int = 130) -> None:
+def at(page: Page, panel: str, above: int = 150) -> None:
     """Scroll so that a panel begins below what stands at the top."""
     page.evaluate(
         "([panel, above]) => window.scrollTo(0, document.getElementById(panel).getBoundingClientRect().top"
@@ -91,6 +91,7 @@ def from_log_to_fallen_error(browser: Browser, folder: Path) -> list[tuple[str, 
         page.fill("[name=mass]", "1.0 kg")
         page.locator("[name=mass]").press("Enter")
         page.locator("#compare figure").first.wait_for()
+        page.wait_for_timeout(2500)
         at(page, "compare")
         take(page, "3  Measured and predicted, while what is missing is looked for")
         idle(page)
@@ -113,9 +114,8 @@ def from_log_to_fallen_error(browser: Browser, folder: Path) -> list[tuple[str, 
 def fitted_and_held_out(browser: Browser, folder: Path) -> list[Path]:
     """A flight with another held out, in dark, and side by side."""
     folder = folder / "held-out"
-    folder.mkdir()
-    flights = SAMPLES / "rotorpy" / "rotor_drag"
-    words = (str(flights / "identify.parquet"), "--validate", str(flights / "validate.parquet"))
+    shutil.copytree(SAMPLES / "rotorpy" / "rotor_drag", folder)
+    words = ("identify.parquet", "--validate", "validate.parquet")
     taken = []
     with workbench(browser, folder, *words, dark=True) as page:
         page.get_by_role("button", name="Add rotor_drag").click()

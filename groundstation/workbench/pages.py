@@ -11,7 +11,7 @@ from markupsafe import Markup
 from trueflight.groundstation.output.cited import CitedValue, environment
 from trueflight.groundstation.output.tables import SAID
 from trueflight.groundstation.workbench.session import PANELS, Session
-from trueflight.groundstation.workbench.tasks import START, Part
+from trueflight.groundstation.workbench.tasks import START, Part, Read
 
 TITLES = {
     "job": "",
@@ -48,7 +48,7 @@ class Pages:
         state = session.state
         values: dict[str, Any] = {
             "state": state,
-            "busy": state.job is not None,
+            "busy": state.job is not None and not isinstance(state.job.task, Read),
             "session": session,
             "START": START,
             "said": SAID,

@@ -24,6 +24,7 @@ from starlette.responses import (
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from trueflight.groundstation.reading.flight_file import is_flight_file
 from trueflight.groundstation.workbench import uploads
 from trueflight.groundstation.workbench.pages import Pages, progress
 from trueflight.groundstation.workbench.session import PANELS, Session
@@ -173,12 +174,12 @@ class Workbench:
     def _end_of_drop(self, asked: Mapping[str, Any]) -> None:
         """All files of one drop are there: its flights, each with the files that go with it."""
         files = self._dropped.pop(str(asked.get("batch", "")), [])
-        flights = [d for d in files if not d.path.name.endswith(uploads.SIDECARS)]
+        flights = [d for d in files if not d.path.name.endswith(uploads.SIDECARS) and is_flight_file(d.path)]
         if files and not flights:
             raise InputError(
                 "no flight among these files: a vehicle or a mapping goes with a flight, drop them together"
             )
-        for one in flights:
+        for one in sorted(flights, key=lambda dropped: dropped.name):
             vehicle, mapping = (uploads.beside(one, files, kind) for kind in uploads.SIDECARS)
             self.session.add_flight(Source(one.path, one.name, vehicle, mapping))
 

@@ -103,6 +103,7 @@ class Session:
         self._worker: Worker | None = None
         self._numbers = 0
         self._to_hold_out = 0
+        self._unasked = False  # whether the fitted flight is still to be compared and diagnosed
 
     def open(self, hand_over: Callable[[Callable[[], None]], None]) -> None:
         """Start the worker; `hand_over` runs a function on the thread of the server."""
@@ -183,6 +184,7 @@ class Session:
 
     def diagnose(self) -> None:
         """Compare, see where, and what is missing, from the version at which the page stands."""
+        self._unasked = False
         self._begin(Diagnose(self._subject()))
 
     def add(self, effects: Sequence[str]) -> None:
@@ -205,7 +207,7 @@ class Session:
         entries = [e for n in flights if (e := self.state.entry(n)) is not None and e.ready]
         if len(entries) * len(models) < 2:
             raise InputError("choose two flights, or two versions")
-        sources = tuple(self._source(e) for e in entries)
+        sources = tuple(e.source for e in entries)
         self._begin(Beside(sources, tuple(models), self.store, self.folder / "results"))
 
     def plan(self, between: Sequence[str] = ()) -> None:
@@ -233,12 +235,13 @@ class Session:
             case Part():
                 self._take(job, message)
             case Ended():
-                self._set(("job", "flights", "missing"), job=None, problem=message.problem)
+                kept = self.state.problem if isinstance(job.task, Read) else ""
+                self._set(PANELS, job=None, problem=message.problem or kept)
                 if message.problem and isinstance(job.task, Read):
                     entry = self.state.entry(job.entry)
                     if entry is not None:
                         self._replace(replace(entry, problem=message.problem), ("flights", "vehicle"))
-                        self._set(("job",), problem="")
+                        self._set(("job",), problem=kept)
                 self._next()
 
     def _take(self, job: Job, part: Part) -> None:
@@ -273,31 +276,39 @@ class Session:
     # --- one after the other --------------------------------------------------------------------------------------
 
     def _next(self) -> None:
-        """Read the next flight that waits; with all read, ask what is missing from the one that was chosen."""
+        """Ask what is missing from the flight that was chosen; then read the next that waits."""
         state = self.state
         if state.job is not None:
             return
-        for number in state.waiting:
+        first = self._to_hold_out if self._to_hold_out in state.waiting and state.fitted else 0
+        if self._unasked and not first:
+            self.diagnose()
+            return
+        for number in (first, *state.waiting) if first else state.waiting:
             entry = state.entry(number)
             self._set((), waiting=tuple(n for n in self.state.waiting if n != number))
             if entry is not None:
-                self._begin(Read(self._source(entry), self.store), number)
+                self._begin(Read(entry.source, self.store), number)
                 return
-        known = state.part("compared") or state.problem
-        chosen = state.entry(state.fitted)
-        if not known and chosen is not None and chosen.ready:
-            self.diagnose()
 
     def _begin(self, task: Task, entry: int = 0) -> None:
         self._free()
         assert self._worker is not None
+        self._unasked = self._unasked and isinstance(task, Read)
         job = Job(task, self._worker.ask(task), time.monotonic(), entry=entry)
         told = self.state.last if isinstance(task, Read) else task.command()
-        self._set(("job", "missing", "flights"), job=job, problem="", last=told)
+        problem = self.state.problem if isinstance(task, Read) else ""
+        self._set(PANELS, job=job, problem=problem, last=told)
 
     def _free(self) -> None:
-        if self.state.job is not None:
-            raise InputError(f"busy {self.state.job.task.title}; cancel it first, or wait")
+        """The worker is to be free: a flight that is being read waits again, anything else is in the way."""
+        job = self.state.job
+        if job is None:
+            return
+        if not isinstance(job.task, Read) or self._worker is None:
+            raise InputError(f"busy {job.task.title}; cancel it first, or wait")
+        self._worker.cancel()
+        self._set((), job=None, waiting=(job.entry, *self.state.waiting))
 
     def _reading(self, number: int) -> bool:
         return self.state.job is not None and self.state.job.entry == number
@@ -309,16 +320,12 @@ class Session:
             raise InputError("drop a flight first, and say what its vehicle is")
         held_out = state.entry(state.held_out)
         return Subject(
-            self._source(fitted),
-            None if held_out is None else self._source(held_out),
+            fitted.source,
+            None if held_out is None else held_out.source,
             self.store,
             state.at,
             self.folder / "results",
         )
-
-    def _source(self, entry: Entry) -> Source:
-        """The file of a flight; one without a vehicle goes by that of the first that has one."""
-        return entry.source
 
     def _select(self, version: str) -> str:
         return replace(Diagnose(self._subject()), about=replace(self._subject(), model=version)).command()
@@ -329,6 +336,7 @@ class Session:
 
     def _fit_to(self, entry: Entry, held_out: int = 0) -> None:
         """The model is fitted to this flight, from the newest version of its vehicle, as the commands do."""
+        self._unasked = True
         newest = f"v{entry.versions[-1]['version']}" if entry.versions else START
         self._set(PANELS, fitted=entry.number, held_out=held_out, at=newest, versions=entry.versions)
 

@@ -8,8 +8,11 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
+from trueflight.groundstation.design.integral_design import with_integral
+from trueflight.groundstation.design.linear_design import ATTITUDE_BANDWIDTH, POSITION_BANDWIDTH, make_design
 from trueflight.groundstation.evaluate.analysis import Analysis, gather
 from trueflight.groundstation.evaluate.compare import compare, waterfall
 from trueflight.groundstation.evaluate.side_by_side import side_by_side
@@ -46,12 +49,15 @@ from trueflight.groundstation.workbench.tasks import (
     Task,
 )
 from trueflight.groundstation.workbench.vehicle_form import drafted_form
+from trueflight.models.design import Design, save_design
 from trueflight.models.effects import effect_named
 from trueflight.models.errors import InputError, plain_line
 from trueflight.models.flight import Flight
 from trueflight.models.model import read_model
 from trueflight.models.whole_file import write_whole
 
+RATE = 100.0
+"""Hz of the controller of a design that is made for a plan."""
 Tell = Callable[[Message], None]
 
 
@@ -255,16 +261,29 @@ def _plan(task: Plan, steps: _Steps) -> None:
     about = task.about
     steps.next("reading the flight")
     flight = _flight(about.flight)
-    gains = design_to_fly(flight.vehicle, flight)
+    about.results.mkdir(parents=True, exist_ok=True)
+    gains, made = _gains(flight, about.results / "design.json")
     steps.next("looking for what is open")
     start = choose_start(flight, about.model, about.store)
     found = diagnose(flight, start, progress=steps.on)
     plan = plan_flight(gains, flight.vehicle, Limits(), found, task.between, progress=steps.on)
-    about.results.mkdir(parents=True, exist_ok=True)
     path = about.results / "plan.csv"
     write_whole(path, setpoints(plan.trajectory), "the plan", "choose another --folder")
     drawn = _drawn(flown=lambda: charts.planned(plan.trajectory))
-    steps.tell(Part("plan", plan_table(plan, path), drawn, {"plan": path}))
+    steps.tell(Part("plan", plan_table(plan, path), drawn, {"plan": path}, {"designed": made}))
+
+
+def _gains(flight: Flight, path: Path) -> tuple[Design, str]:
+    """The design that the vehicle will fly by; where there is none, one with the usual bandwidths, written to `path`,
+    and the command that makes it."""
+    try:
+        return design_to_fly(flight.vehicle, flight), ""
+    except InputError:
+        made = with_integral(
+            make_design(flight.vehicle, POSITION_BANDWIDTH, ATTITUDE_BANDWIDTH, RATE), flight.vehicle
+        )
+        save_design(made, path)
+        return made, shlex.join(["groundstation", "design", flight.vehicle.source, "-o", str(path)])
 
 
 def _flights(about: Subject) -> tuple[Flight, Flight | None]:

@@ -29,6 +29,7 @@ function lost(is) {
 // --- what changed -------------------------------------------------------------------------------------------------
 
 const newest = {};
+const HEAD = 160; // px that stand at the top of the window
 
 /** Put the newest state of a panel in place, with the focus, what is unfolded and what was typed kept. */
 async function refresh(panel) {
@@ -38,7 +39,10 @@ async function refresh(panel) {
   const body = await answer.text();
   const focus = panel.contains(document.activeElement) ? describe(document.activeElement) : null;
   const open = new Map([...panel.querySelectorAll("details[data-keep]")].map((d) => [d.dataset.keep, d.open]));
+  const before = panel.getBoundingClientRect();
   panel.innerHTML = body;
+  // what is above what is being read changes its height, and moves nothing
+  if (before.bottom < HEAD) window.scrollBy({ top: panel.getBoundingClientRect().height - before.height, behavior: "instant" });
   panel.dataset.revision = answer.headers.get("X-Revision");
   for (const details of panel.querySelectorAll("details[data-keep]"))
     if (open.has(details.dataset.keep) && !details.querySelector(".wrong")) details.open = open.get(details.dataset.keep);
