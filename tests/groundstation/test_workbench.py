@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import programs
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 from processes import with_parent
@@ -96,57 +97,62 @@ def test_from_a_dropped_log_to_a_fallen_error_and_back(browser: Browser, tmp_pat
         expect(here).to_contain_text("none added")
         page.get_by_role("button", name="Compare", exact=True).click()
         expect(page.locator("#beside figure svg").first).to_be_visible()
-
-
-def test_a_worst_moment_moves_the_time_of_the_viewer(browser: Browser, tmp_path: Path) -> None:
-    with opened(browser, tmp_path, LOG, viewer="on") as page:
+        other.close()
+        # a worst moment moves the time of the viewer, which says itself where it is
+        page.get_by_role("button", name="3D and curves").click()
         jump = page.locator("#where button.jump").first
         jump.click()
         moment = float(jump.get_attribute("data-seconds") or "nan")
         expect(page.locator("#viewer")).to_have_attribute("data-at", f"{moment:g}")
 
 
-def test_a_vehicle_is_drafted_and_a_wrong_unit_refused_beside_its_field(
-    browser: Browser, tmp_path: Path
-) -> None:
-    with opened(browser, tmp_path) as page:
-        drop(page, LOG)
-        mass = page.get_by_label("mass, with battery")
-        expect(page.locator(".field", has=mass)).to_contain_text("SIH_MASS")
-        expect(page.locator(".field", has=page.get_by_label("radius of a propeller"))).to_contain_text(
-            "guess"
-        )
-        mass.fill("0.8 m")
-        page.keyboard.press("Enter")
-        expect(page.locator(".field", has=mass)).to_contain_text("'m' is no unit of mass")
-        expect(mass).to_be_focused()
-        mass.fill("800 g")
-        page.keyboard.press("Enter")
-        # what is being done can be ended, and the page stays
-        expect(page.locator("#doing")).to_contain_text("what is missing")
-        page.keyboard.press("Escape")
-        expect(page.locator("#job .problem")).to_contain_text("cancelled")
-        written = (tmp_path / "trueflight-workbench" / "vehicles" / "001.vehicle.toml").read_text()
-        assert "mass = 0.8\n" in written
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("bench")
 
 
-def test_a_bad_file_is_one_line_in_the_words_of_the_terminal(browser: Browser, tmp_path: Path) -> None:
-    cut = tmp_path / "cut.ulg"
+@pytest.fixture(scope="module")
+def bench(browser: Browser, folder: Path) -> Iterator[Page]:
+    with opened(browser, folder) as page:
+        yield page
+
+
+def test_a_bad_file_is_one_line_in_the_words_of_the_terminal(bench: Page, folder: Path) -> None:
+    cut = folder / "cut.ulg"
     cut.write_bytes(LOG.read_bytes()[:3000])
-    shutil.copy(VEHICLE, tmp_path)
-    evil = tmp_path / "<img src=x onerror=alert(1)>.exe"
+    shutil.copy(VEHICLE, folder)
+    evil = folder / "<img src=x onerror=alert(1)>.exe"
     evil.write_text("no flight")
-    program = Path(sys.executable).with_name("groundstation")
-    said = subprocess.run([program, "import", cut, "--check"], capture_output=True, text=True, cwd=tmp_path)
+    said = programs.run("groundstation", "import", cut, "--check")
     words = said.stderr.removeprefix(f"error: {cut}").strip()
-    with opened(browser, tmp_path, "--folder", "bench") as page:
-        drop(page, cut, VEHICLE)
-        expect(page.locator("#flights tr .problem")).to_have_text(f"cut.ulg{words}")
-        drop(page, evil)
-        expect(page.locator("#drop-problem")).to_contain_text("is no kind of flight file")
-        drop(page, VEHICLE)
-        expect(page.locator("#drop-problem")).to_contain_text("no flight among these files")
-    assert all(
-        re.fullmatch(r"\d{4}\.(ulg|vehicle\.toml)", p.name)
-        for p in (tmp_path / "bench" / "dropped").iterdir()
-    )
+    drop(bench, cut, VEHICLE)
+    expect(bench.locator("#flights tr .problem")).to_have_text(f"cut.ulg{words}")
+    drop(bench, evil)
+    expect(bench.locator("#drop-problem")).to_contain_text("is no kind of flight file")
+    drop(bench, VEHICLE)
+    expect(bench.locator("#drop-problem")).to_contain_text("no flight among these files")
+    stored = [p.name for p in (folder / "trueflight-workbench" / "dropped").iterdir()]
+    assert [name for name in stored if not re.fullmatch(r"\d{4}\.(ulg|vehicle\.toml)", name)] == []
+    bench.get_by_role("button", name="take cut.ulg off the page").click()
+    expect(bench.locator("#flights tbody tr")).to_have_count(0)
+
+
+def test_a_vehicle_is_drafted_and_a_wrong_unit_refused_beside_its_field(bench: Page, folder: Path) -> None:
+    drop(bench, LOG)
+    mass = bench.get_by_label("mass, with battery")
+    beside = bench.locator(".field", has=mass)
+    expect(beside).to_contain_text("SIH_MASS")
+    radius = bench.locator(".field", has=bench.get_by_label("radius of a propeller"))
+    expect(radius).to_contain_text("guess")
+    mass.fill("0.8 m")
+    bench.keyboard.press("Enter")
+    expect(beside).to_contain_text("'m' is no unit of mass")
+    expect(mass).to_be_focused()
+    mass.fill("800 g")
+    bench.keyboard.press("Enter")
+    # what is being done can be ended, and the page stays
+    expect(bench.locator("#doing")).to_contain_text("what is missing")
+    bench.keyboard.press("Escape")
+    expect(bench.locator("#job .problem")).to_contain_text("cancelled")
+    written = list((folder / "trueflight-workbench" / "vehicles").iterdir())
+    assert ["mass = 0.8\n" in path.read_text() for path in written] == [True]
