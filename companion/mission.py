@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.outcome import LANDING, MISSION, TAKEOFF
 from trueflight.companion.stopping import Safety
-from trueflight.models.contract import CONTROLLERS, CORRECTED
+from trueflight.models.contract import CORRECTED
+from trueflight.models.controllers import check_controller
 from trueflight.models.errors import InputError
 from trueflight.models.reference import Trajectory, transfer
 from trueflight.models.trajectory import Waypoint, path
@@ -38,10 +39,7 @@ class Mission:
     proving: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.controller not in CONTROLLERS:
-            raise InputError(
-                f"controller '{self.controller}' is unknown; use one of {', '.join(CONTROLLERS)}"
-            )
+        check_controller(self.controller)
         if (self.guard is None) != (self.controller != CORRECTED):
             raise InputError("controller 'corrected' needs a deployed model")
 

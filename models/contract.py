@@ -7,8 +7,10 @@ import hashlib
 CONTRACT_VERSION = "1"
 
 LQR, LQR_INTEGRAL, CORRECTED = "lqr", "lqr_integral", "corrected"
-CONTROLLERS = (LQR, LQR_INTEGRAL, CORRECTED)
-"""What a mission can be flown with: the cascade, the cascade with an integral, the cascade with its correction."""
+INDI, L1_ADAPTIVE, GEOMETRIC, PX4_CASCADE = "indi", "l1_adaptive", "geometric", "px4_cascade"
+CONTROLLERS = (LQR, LQR_INTEGRAL, CORRECTED, INDI, L1_ADAPTIVE, GEOMETRIC, PX4_CASCADE)
+"""What a mission can be flown with: the cascade, the cascade with an integral, the cascade with its correction; to be
+compared with them, controllers after other papers. `models.controllers` has those of installed packages beside them."""
 
 INPUT_NAME, OUTPUT_NAME = "features", "delta"
 """float32 [N, F] in, float32 [N, 3] out: error acceleration in m/s², heading frame."""

@@ -413,6 +413,35 @@ def _lemniscate(
 
 
 @_kind(
+    "vertical_eight",
+    "an upright figure of eight; as it stands x 1.25 sin t, z 0.75 sin 2t, which Neural-Fly flies in its winds",
+    Parameter("width", 2.5, 0.2, 100.0, "m", "length along x"),
+    Parameter("rise", 1.5, 0.2, 20.0, "m", "height from the lowest to the highest point"),
+    Parameter("speed", math.hypot(1.25, 1.5), 0.05, 15.0, "m/s", "greatest reference speed"),
+    Parameter("height", 2.0, 0.1, 50.0, "m", "height of the crossing above ground"),
+    Parameter("laps", 4.0, 1.0, 100.0, "", "how often"),
+    YAW,
+)
+def _vertical_eight(
+    width: float, rise: float, speed: float, height: float, laps: float, yaw: float
+) -> list[Segment]:
+    if height <= 0.5 * rise:
+        raise InputError(
+            f"trajectory 'vertical_eight': height {height:g} m leaves no room for a rise of {rise:g} m"
+        )
+    angle = 2 * math.pi * round(laps)
+    duration, ramp = _turning_time(math.hypot(0.5 * width, rise) * angle, speed)
+    waves = (
+        Wave(0.0, amplitude=0.5 * width, frequency=angle),
+        Wave(0.0),
+        Wave(height, amplitude=0.5 * rise, frequency=2 * angle),
+        Wave(yaw),
+    )
+    base = (0.0, 0.0, height, yaw)
+    return [hold(base, 1.0), Curve(duration, ramp, waves), hold(base, 1.0)]
+
+
+@_kind(
     "low_pass",
     "fast and slow passes close to the ground, with a dip before and a climb after each",
     Parameter("low", 0.2, 0.08, 20.0, "m", "height of the pass above ground"),

@@ -3,6 +3,7 @@
 * `lqr`: the linear cascade alone.
 * `lqr_integral`: the cascade with an integral in the position loop, the paper's third controller.
 * `corrected`: the cascade with the learned correction (22), the inverse of the known actuation, and a slow trim.
+* `indi`, `l1_adaptive`, `geometric`, `px4_cascade`: after other papers, to compare with; each in its own module.
 
 The correction has to arrive as an acceleration, so what lies between command and acceleration is undone where
 it is known. Thrust acts after the motors' delay and lag, tilt in addition only through the attitude loop. So the
@@ -33,14 +34,17 @@ from trueflight.companion.law.control import (
     features,
     world_from_body,
 )
+from trueflight.companion.law.geometric import Geometric
 from trueflight.companion.law.guard import Correction
-from trueflight.models.contract import CONTROLLERS, CORRECTED, LQR, LQR_INTEGRAL
+from trueflight.companion.law.indi import Indi
+from trueflight.companion.law.l1_adaptive import L1Adaptive
+from trueflight.companion.law.px4_cascade import Px4Cascade
+from trueflight.companion.law.steps import Controller, Preview
+from trueflight.models.contract import CORRECTED, GEOMETRIC, INDI, L1_ADAPTIVE, LQR, LQR_INTEGRAL, PX4_CASCADE
+from trueflight.models.controllers import check_controller, plug_ins
 from trueflight.models.errors import InputError
 from trueflight.models.trajectory import ReferenceSample
 from trueflight.models.vehicle import GRAVITY
-
-Preview = Callable[[float], ReferenceSample]
-"""The reference so many seconds from now; it holds still after its end."""
 
 AHEAD = 0.02
 """s over which the correction's rate of change is taken, where no lag asks for more."""
@@ -76,22 +80,6 @@ class Corrector(Protocol):
         ...
 
 
-class Controller(Protocol):
-    """One controller during one flight; it belongs to the control thread."""
-
-    def step(self, state: State, preview: Preview, dt: float) -> ControlStep:
-        """One tick; `dt` s since the previous one."""
-        ...
-
-    def start(self) -> None:
-        """The correction, or the mission's trajectory, begins with the next tick."""
-        ...
-
-    def stop(self) -> None:
-        """The correction is over."""
-        ...
-
-
 @dataclass(frozen=True)
 class TrimLimits:
     """The slow trim of `corrected`: it removes what is left between the flight and its linear behaviour.
@@ -112,15 +100,27 @@ def make_controller(
     trim: TrimLimits | None = None,
 ) -> Controller:
     """The controller of this name; raises `InputError` for an unknown one or one that lacks what it needs."""
-    if name == LQR:
-        return Lqr(law)
-    if name == LQR_INTEGRAL:
-        return LqrIntegral(law)
-    if name != CORRECTED:
-        raise InputError(f"controller '{name}' is unknown; use one of {', '.join(CONTROLLERS)}")
-    if corrector is None:
-        raise InputError("controller 'corrected' needs a deployed model")
-    return Corrected(law, corrector, trim or TrimLimits())
+    if name == CORRECTED:
+        if corrector is None:
+            raise InputError("controller 'corrected' needs a deployed model")
+        return Corrected(law, corrector, trim or TrimLimits())
+    check_controller(name)
+    return _ALONE[name](law) if name in _ALONE else _plugged(name, law)
+
+
+def _plugged(name: str, law: ControlLaw) -> Controller:
+    """A controller of an installed package; whatever fails there is told in one line."""
+    entry = plug_ins()[name]
+    try:
+        made = entry.load()(law)
+    except InputError:
+        raise
+    except Exception as error:  # noqa: BLE001 - somebody else's code may fail in any way
+        raise InputError(f"controller '{name}' of {entry.value}: {type(error).__name__}: {error}") from None
+    if not all(callable(getattr(made, part, None)) for part in ("step", "start", "stop")):
+        raise InputError(f"controller '{name}' of {entry.value}: it lacks step, start or stop")
+    controller: Controller = made
+    return controller
 
 
 class Lqr:
@@ -359,3 +359,14 @@ def _euler_rates(zeta: Vector, body: Vector) -> Vector:
     cp = max(0.2, math.cos(pitch))
     turning = (sr * q + cr * r) / cp
     return p + math.sin(pitch) * turning, cr * q - sr * r, turning
+
+
+_ALONE: dict[str, Callable[[ControlLaw], Controller]] = {
+    LQR: Lqr,
+    LQR_INTEGRAL: LqrIntegral,
+    INDI: Indi,
+    L1_ADAPTIVE: L1Adaptive,
+    GEOMETRIC: Geometric,
+    PX4_CASCADE: Px4Cascade,
+}
+"""Those that need no model."""

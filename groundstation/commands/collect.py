@@ -54,10 +54,10 @@ def collect_command(
     low); the same command continues with the flights that are missing, on another battery for instance.
     """
     from trueflight.groundstation.operate.link import Link
-    from trueflight.groundstation.operate.mission import check_controller
+    from trueflight.models.controllers import check_controller
     from trueflight.models.database import Collection, database, record_name
 
-    check_controller(controller)
+    check_controller(controller, "--controller")
     sorties = {
         record_name(number, sortie): sortie for number, sortie in enumerate(database(seed, minutes), 1)
     }

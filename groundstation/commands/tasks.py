@@ -117,6 +117,11 @@ TASKS: dict[str, dict[str, Entry]] = {
             "Collect, diagnose, train and fly every controller on flights no model has seen; print the paper's "
             "Table I.",
         ),
+        "compare-controllers": Entry(
+            "compare_controllers",
+            "Fly every controller on the same vehicles, winds, payloads, batteries and paths, and print how far each "
+            "is off.",
+        ),
     },
     "Fly": {
         "fly": Entry(

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from trueflight.models.contract import CONTROLLERS, too_large
+from trueflight.models.contract import too_large
+from trueflight.models.controllers import check_controller
 from trueflight.models.errors import InputError
 from trueflight.models.reference import check_duration, trajectory_from_csv
 from trueflight.models.reference import trajectory as named
@@ -20,18 +21,12 @@ def mission_of(
 
     Raises `InputError` for whatever a companion would refuse of it, as far as that can be known here.
     """
-    check_controller(controller)
+    check_controller(controller, "--controller")
     flown = _flown(trajectory, assignments, repeat)
     mission = {**flown, "controller": controller, "repeat": repeat}
     if reason := too_large("mission", len(json.dumps(mission))):
         raise InputError(f"{trajectory}: {reason}; split the file")
     return mission
-
-
-def check_controller(controller: str) -> None:
-    """Raise `InputError` for a controller that no companion knows."""
-    if controller not in CONTROLLERS:
-        raise InputError(f"--controller is '{controller}'; choose one of {', '.join(CONTROLLERS)}")
 
 
 def _flown(trajectory: str, parameters: Sequence[str], repeat: int) -> dict[str, Any]:
