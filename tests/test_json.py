@@ -30,6 +30,7 @@ PROGRAMS = {"groundstation": groundstation, "companion": companion, "sim-bridge"
 ELSEWHERE = {
     "groundstation calibrate": "groundstation/test_calibration.py",
     "groundstation collect": "groundstation/test_collect.py",
+    "groundstation compare-controllers": "groundstation/test_compare_controllers.py",
     "groundstation deploy": "companion/test_deployment.py",
     "groundstation fly": "groundstation/test_link.py",
     "groundstation status": "groundstation/test_link.py",

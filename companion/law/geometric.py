@@ -24,7 +24,7 @@ from trueflight.companion.law.outer_loop import LONGEST_STEP, OuterLoop, bounded
 from trueflight.companion.law.steps import Preview, plain_step
 from trueflight.models.vehicle import GRAVITY
 
-ADAPTATION = 1.0
+ADAPTATION = 8.0
 """1/s, of the error in velocity; `c` is what makes both errors of a settled loop weigh alike."""
 
 

@@ -23,7 +23,7 @@ from trueflight.companion.law.control import (
 from trueflight.companion.law.outer_loop import ActingThrust, LowPass, OuterLoop, bounded
 from trueflight.companion.law.steps import Preview, plain_step
 
-FREQUENCY = 1.0
+FREQUENCY = 32.0
 """Hz of both filters."""
 
 
@@ -44,7 +44,7 @@ class Indi:
     def step(self, state: State, preview: Preview, dt: float) -> ControlStep:
         """One tick."""
         reference, zeta = preview(0.0), euler(state.quaternion)
-        acting = self._thrust.step(state.quaternion, dt)
+        acting = world_from_body(state.quaternion, (0.0, 0.0, self._thrust.step(dt)))
         pushed = bounded(self._pushed(state, acting, dt))
         wanted = self._loop.wanted(state, zeta[2], reference)
         asked = (wanted[0] - pushed[0], wanted[1] - pushed[1], wanted[2] - pushed[2])

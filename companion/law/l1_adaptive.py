@@ -1,9 +1,10 @@
 """L1 adaptive control around the linear cascade.
 
-A predictor of the velocity runs beside the flight, `v_hat' = tau - g + sigma + A_s (v_hat - v)`; each tick the
-disturbance `sigma` that takes its error away is found in closed form (piecewise constant adaptation), and a low-pass
-of it is taken from what the cascade asks for. The adaptation is as fast as the ticks; how much of it is used, and
-how robust it is, is the low-pass alone: which is what L1 is about.
+A predictor of the velocity runs beside the flight, `v_hat' = A_zeta (phi, theta, T - m g) + sigma + A_s (v_hat - v)`,
+with the cascade's own hover linearisation, so that what that leaves out is in `sigma` too; each tick the disturbance
+`sigma` that takes its error away is found in closed form (piecewise constant adaptation), and a low-pass of it is taken
+from what the cascade asks for. The adaptation is as fast as the ticks; how much of it is used, and how robust it is,
+is the low-pass alone: which is what L1 is about.
 
 Source: Wu, Cheng, Ackerman, Gahlawat, Lakshmanan, Zhao, Hovakimyan, "L1 adaptive augmentation for geometric tracking
 control of quadrotors", ICRA 2022, equations (6) to (10), for the translation; Hovakimyan and Cao, "L1 Adaptive Control
@@ -21,7 +22,7 @@ from trueflight.models.vehicle import GRAVITY
 
 PREDICTOR = 5.0
 """1/s, the decay rate of the predictor's error."""
-FREQUENCY = 0.4
+FREQUENCY = 0.2
 """Hz of the low-pass."""
 
 
@@ -43,16 +44,18 @@ class L1Adaptive:
     def step(self, state: State, preview: Preview, dt: float) -> ControlStep:
         """One tick."""
         law, reference, zeta = self._law, preview(0.0), euler(state.quaternion)
-        self._adapt(state, min(LONGEST_STEP, max(0.0, dt)))
+        self._adapt(state, zeta, min(LONGEST_STEP, max(0.0, dt)))
         c, s = math.cos(zeta[2]), math.sin(zeta[2])
         x, y, z = self._used
         attitude = law.corrected(law.feedback(state, zeta[2], reference), (c * x + s * y, c * y - s * x, z))
         self._thrust.commanded(attitude.thrust)
         return plain_step(law, zeta, attitude, reference.yaw)
 
-    def _adapt(self, state: State, dt: float) -> None:
+    def _adapt(self, state: State, zeta: Vector, dt: float) -> None:
         """The disturbance of the last tick, and how much of it is used, m/s², world."""
-        acting = self._thrust.step(state.quaternion, dt)
+        c, s, (roll, pitch, _) = math.cos(zeta[2]), math.sin(zeta[2]), zeta
+        ahead, aside = GRAVITY * pitch, -GRAVITY * roll
+        acting = (c * ahead - s * aside, s * ahead + c * aside, self._thrust.step(dt))
         if self._predicted is None or dt <= 0.0:
             self._predicted = state.velocity
             return

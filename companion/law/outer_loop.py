@@ -15,7 +15,6 @@ from trueflight.companion.law.control import (
     ControlLaw,
     State,
     Vector,
-    world_from_body,
 )
 from trueflight.models.trajectory import ReferenceSample
 from trueflight.models.vehicle import GRAVITY
@@ -98,7 +97,8 @@ def mixed(one: Vector, other: Vector, share: float) -> Vector:
 
 
 class ActingThrust:
-    """The specific thrust that acts now (m/s², world), by what was commanded and the vehicle file's delay and lag."""
+    """The specific thrust that acts now (m/s², along the body's z axis), by what was commanded and the vehicle file's
+    delay and lag."""
 
     def __init__(self, law: ControlLaw) -> None:
         vehicle = law.vehicle
@@ -107,15 +107,15 @@ class ActingThrust:
         self._due = self._acting = vehicle.weight
         self._clock = 0.0
 
-    def step(self, quaternion: tuple[float, float, float, float], dt: float) -> Vector:
-        """Its value `dt` s later, at this attitude."""
+    def step(self, dt: float) -> float:
+        """Its value `dt` s later."""
         dt = min(LONGEST_STEP, max(0.0, dt))
         self._clock += dt
         while self._waiting and self._waiting[0][0] <= self._clock - self._delay + 1e-9:
             self._due = self._waiting.popleft()[1]
         share = 1.0 - math.exp(-dt / self._lag) if self._lag > 0.0 else 1.0
         self._acting += share * (self._due - self._acting)
-        return world_from_body(quaternion, (0.0, 0.0, self._acting / self._mass))
+        return self._acting / self._mass
 
     def commanded(self, thrust: float) -> None:
         """A thrust (N) goes out now."""

@@ -80,7 +80,8 @@ def compare_controllers(
         print_json(comparison(cells, flights))
         return
     for measure, title in MEASURES.items():
-        console.print(_table(cells, flights, names, measure, title))
+        console.print(f"RMSE {title}, cm: median, least..greatest of the vehicles", style="bold")
+        console.print(_table(cells, flights, names, measure))
     for one in flights:
         console.print(f"{one.name}: {one.title}", style="dim", highlight=False)
     for cell in cells:
@@ -91,10 +92,10 @@ def compare_controllers(
 
 
 def _table(
-    cells: Sequence[Cell], flights: Sequence[Disturbance], names: Sequence[str], measure: str, title: str
+    cells: Sequence[Cell], flights: Sequence[Disturbance], names: Sequence[str], measure: str
 ) -> Table:
     """One row a controller, so that it stays narrow however many are installed; the best of a column is bold."""
-    table = Table(title=f"RMSE {title}, cm: median, least..greatest", box=box.SIMPLE, padding=(0, 1, 0, 0))
+    table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     table.add_column("controller")
     for flight in flights:
         table.add_column(flight.name, justify="right")

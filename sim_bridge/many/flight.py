@@ -191,7 +191,7 @@ def _crew(name: str, plans: Sequence[Plan], laws: Sequence[ControlLaw], period: 
     if name == LQR_INTEGRAL:
         return ManyLqrIntegral(laws)
     if name != CORRECTED:
-        raise InputError(f"controller '{name}' is unknown")
+        raise InputError(f"controller '{name}' is flown one at a time; use `sim-bridge fly`")
     from trueflight.sim_bridge.many.corrected import ManyCorrected
 
     return ManyCorrected(laws, plans, period)

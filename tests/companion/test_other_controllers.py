@@ -87,7 +87,7 @@ def test_acting_thrust_is_what_was_commanded_a_delay_ago_through_the_lag() -> No
     acting, delay, lag = ActingThrust(LAW), VEHICLE.command_delay, VEHICLE.motor_time_constant
     times, seen = DT * np.arange(60), []
     for _ in times:
-        seen.append(acting.step((1.0, 0.0, 0.0, 0.0), DT)[2] * VEHICLE.mass)
+        seen.append(acting.step(DT) * VEHICLE.mass)
         acting.commanded(1.5 * VEHICLE.weight)
     share = np.array(seen) / VEHICLE.weight - 1.0
     assert share[times < delay].max(initial=0.0) == 0.0

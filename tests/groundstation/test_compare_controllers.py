@@ -1,0 +1,52 @@
+"""Controllers beside each other: flown by the real program, in both measures, kept, and refused by name."""
+
+import json
+from pathlib import Path
+
+import programs
+import pytest
+from json_schemas import valid
+
+from trueflight.groundstation.study.controllers import DISTURBANCES, Cell, chosen_controllers
+from trueflight.models.contract import CONTROLLERS
+
+
+def asked(output: Path, *more: str) -> tuple[str, ...]:
+    return ("compare-controllers", "-o", str(output), "--seeds", "1", *more)
+
+
+def test_two_controllers_in_a_wind_are_told_in_both_measures_and_kept(tmp_path: Path) -> None:
+    words = asked(
+        tmp_path / "study",
+        *("--controller", "lqr", "--controller", "geometric", "--disturbance", "eight-4.2"),
+        *("--hidden", "rotor_drag:0.4"),
+    )
+    done = programs.run("groundstation", *words, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = valid("groundstation compare-controllers", json.loads(done.stdout))
+    reference = told["median"]["reference"]["eight-4.2"]
+    assert 0.0 < reference["geometric"] < 0.7 * reference["lqr"]
+    assert told["median"]["linear"]["eight-4.2"]["lqr"] > 0.05  # the wind is no part of the design
+    again = programs.run("groundstation", *words, cwd=tmp_path)
+    assert again.returncode == 0
+    assert f"{100 * reference['lqr']:.1f}" in again.stdout and "to the linear behaviour" in again.stdout
+    cells = sorted((tmp_path / "study" / "vehicle-1").glob("*.json"))
+    assert len(cells) == 2 and all(Cell(**json.loads(c.read_text())).outcome == "finished" for c in cells)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--controller", "pid"), "--controller 'pid' is unknown"),
+        (("--disturbance", "rain"), "--disturbance rain: unknown"),
+    ],
+)
+def test_unknown_names_are_refused_in_one_line_and_nothing_is_made(words, told: str, tmp_path: Path) -> None:
+    done = programs.run("groundstation", *asked(tmp_path / "study", *words), cwd=tmp_path)
+    assert done.returncode == 2 and told in done.stderr
+    assert not (tmp_path / "study").exists()
+
+
+def test_every_controller_is_flown_unless_some_are_named() -> None:
+    assert set(CONTROLLERS) <= set(chosen_controllers(None))
+    assert len({d.name for d in DISTURBANCES}) == len(DISTURBANCES)
