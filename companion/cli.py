@@ -124,10 +124,6 @@ def check(
     as_json: Json = False,
 ) -> None:
     """Connect and tell what arrives: rates, mode, battery, and the parameters that matter in trouble."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     from trueflight.companion.batteries import Batteries
     from trueflight.companion.settings import Settings
     from trueflight.companion.vehicle_link import VehicleLink
@@ -164,6 +160,14 @@ def check(
     if as_json:
         print_json_line(report)
         return
+    _print_checked(report)
+
+
+def _print_checked(report: dict[str, Any]) -> None:
+    from rich.markup import escape
+
+    from trueflight.models.terminal import Table, Terminal
+
     table = Table("", "", show_header=False)
     for key, value in report.items():
         if isinstance(value, dict):
@@ -171,17 +175,16 @@ def check(
                 f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in value.items()
             )
         table.add_row(key.replace("_", " "), escape(str(value)))
-    Console().print(table)
+    Terminal().print(table)
 
 
 @app.command(epilog="Example: companion trajectories --json")
 def trajectories(as_json: Json = False) -> None:
     """List the trajectories that can be flown by name, with their parameters."""
-    from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
 
     from trueflight.models.reference import KINDS
+    from trueflight.models.terminal import Table, Terminal
 
     if as_json:
         listing = {
@@ -202,7 +205,7 @@ def trajectories(as_json: Json = False) -> None:
             for p in kind.parameters
         ]
         table.add_row(name, kind.text, escape(", ".join(parameters)))
-    Console().print(table)
+    Terminal().print(table)
 
 
 onboard_commands.register(app)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rich.markup import escape
-from rich.table import Table
+
+from trueflight.models.terminal import Table
 
 OK, NOTE, WARN, DANGER, FAIL = STATES = ("ok", "note", "warn", "danger", "fail")
 """How bad it is, mildest first; `note` is no judgement, `danger` is what was asked for and bars no flight."""
@@ -27,9 +28,9 @@ class Finding:
 
 
 def table_of(title: str, findings: Sequence[Finding], last: str = "why") -> Table:
-    """Findings for a terminal of 100 columns; without a column that would stay empty."""
+    """Findings for a terminal; without a column that would stay empty."""
     wanted = any(finding.wanted for finding in findings)
-    table = Table(title=title, title_justify="left", title_style="bold")
+    table = Table(title=title, title_style="bold")
     table.add_column("", no_wrap=True)
     table.add_column("what", max_width=22)
     table.add_column("found", max_width=30)

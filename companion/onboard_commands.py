@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn
 
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json_line
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.companion.pose import PoseFeed
+    from trueflight.companion.preflight import Preflight
     from trueflight.companion.settings import Settings
     from trueflight.companion.vehicle_link import VehicleLink
     from trueflight.models.vehicle import Vehicle
 
-console = Console()
+console = Terminal()
 _FAILED = 2
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
@@ -82,7 +83,6 @@ def preflight_command(
     """
     from trueflight.companion import preflight
     from trueflight.companion.batteries import Batteries
-    from trueflight.companion.findings import table_of
     from trueflight.companion.vehicle_link import VehicleLink
     from trueflight.models.vehicle import load_vehicle
 
@@ -106,21 +106,25 @@ def preflight_command(
     if as_json:
         print_json_line({**preflight.as_json(report), "changed": changed})
     else:
-        console.print(f"{report.autopilot} on {escape(settings.connect)}")
-        console.print(table_of("Arming", report.arming, "what to do"))
-        console.print(table_of("Parameters", report.parameters))
-        console.print(table_of("Message rates", report.rates))
-        console.print(table_of("Hover thrust", report.hover))
-        console.print(table_of("Who may fly it", report.access))
-        for line in changed:
-            console.print(escape(line), highlight=False)
-        open_changes = [p.name for p in (*report.parameters, *report.hover) if p.change is not None]
-        if open_changes and not set_parameters:
-            console.print(f"--set-params would set: {', '.join(open_changes)}")
-        console.print(
-            "[green]ready for a flight[/]" if report.ready else "[bold red]not ready for a flight[/]"
-        )
+        _print_preflight(report, settings.connect, changed, set_parameters)
     raise typer.Exit(0 if report.ready else _FAILED)
+
+
+def _print_preflight(report: Preflight, address: str, changed: Sequence[str], asked: bool) -> None:
+    from trueflight.companion.findings import table_of
+
+    console.print(f"{report.autopilot} on {escape(address)}")
+    console.print(table_of("Arming", report.arming, "what to do"))
+    console.print(table_of("Parameters", report.parameters))
+    console.print(table_of("Message rates", report.rates))
+    console.print(table_of("Hover thrust", report.hover))
+    console.print(table_of("Who may fly it", report.access))
+    for line in changed:
+        console.print(escape(line), highlight=False)
+    open_changes = [p.name for p in (*report.parameters, *report.hover) if p.change is not None]
+    if open_changes and not asked:
+        console.print(f"--set-params would set: {', '.join(open_changes)}")
+    console.print("[green]ready for a flight[/]" if report.ready else "[bold red]not ready for a flight[/]")
 
 
 def doctor_command(
@@ -258,7 +262,7 @@ def _poses(settings: Settings, vehicle: Vehicle | None, link: VehicleLink) -> It
 @contextmanager
 def _progress(quiet: bool) -> Iterator[Any]:
     """A line that tells what is being looked at, on a terminal that people see."""
-    errors = Console(stderr=True)
+    errors = Terminal(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=errors, transient=True, disable=quiet or not errors.is_terminal) as bar:
         task = bar.add_task("looking", total=None)

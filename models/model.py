@@ -37,8 +37,8 @@ class Model:
     """One version of a model of one vehicle.
 
     `terms` in the order in which they were added; `parent` is the version it was made from; `data_hash` the SHA-256
-    of the data that its effects were fitted to; `fit` holds the figures of that fit (residual RMS, m/s²). `network`
-    was trained on what exactly these effects leave unexplained.
+    of the data that its effects were fitted to, `fitted_to` the names of those flights; `fit` holds the figures of that
+    fit (residual RMS, m/s²). `network` was trained on what exactly these effects leave unexplained.
     """
 
     vehicle: Vehicle
@@ -51,6 +51,7 @@ class Model:
     fit: Mapping[str, float] = field(default_factory=dict)
     effects_directory: str | None = None
     network: Network | None = None
+    fitted_to: tuple[str, ...] = ()
 
     def chain(self) -> list[tuple[Effect, Mapping[str, float]]]:
         """All of the model, ready for `models.prediction`: the effects with their values, then the network."""
@@ -147,7 +148,14 @@ def read_model(path: Path) -> Model:
         fit=_figures(path, table),
         effects_directory=directory,
         network=None if learnt is None else network_from_table(learnt, f"{path}: network"),
+        fitted_to=tuple(_name(path, one) for one in _typed(path, table, "fitted_to", (list,), [])),
     )
+
+
+def _name(path: Path, name: object) -> str:
+    if not isinstance(name, str):
+        raise InputError(f"{path}: 'fitted_to' holds {shown(name)}, which is no name of a flight; {_RESTORE}")
+    return name
 
 
 def _figures(path: Path, table: dict[str, Any]) -> dict[str, float]:

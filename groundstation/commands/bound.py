@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from trueflight.groundstation.commands.options import DesignOption, JsonOption, SaveOption, VehicleOption
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     pass
 
-console = Console()
+console = Terminal()
 
 
 class AroundWhat(StrEnum):

@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from trueflight.groundstation.commands.options import JobsOption, JsonOption
 from trueflight.groundstation.output.terminal import counted
 from trueflight.models.printed import print_json
 from trueflight.models.shipped import QUAD5
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.evaluate.calibration import Case
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
@@ -21,14 +22,16 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import print_written, working
+from trueflight.groundstation.output.terminal import print_start, print_written, working
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.models.flight import Flight
     from trueflight.models.model import Model
 
-console = Console()
+console = Terminal()
+AGAINST = "held against"
 
 
 def register(app: typer.Typer) -> None:
@@ -112,6 +115,7 @@ def _one_flight(
             }
         )
         return
+    print_start(console, line[-1], AGAINST)
     print_comparisons(console, results)
     print_where(console, where)
     print_written(console, save, output)
@@ -144,8 +148,34 @@ def _side_by_side(
     if as_json:
         print_json({**table, **_written(save, output)})
         return
+    for name, model in _which(beside.names, [model for its in models for model in its]):
+        print_start(console, model, f"{name}{AGAINST}")
     print_side_by_side(console, beside)
+    if told := _how_flown(flights):
+        console.print(told, style="yellow", highlight=False, markup=False)
     print_written(console, save, output)
+
+
+def _which(names: Sequence[str], models: Sequence[Model]) -> Iterator[tuple[str, Model]]:
+    """What each is held against, behind its name; one for all behind none."""
+    if all(model == models[0] for model in models):
+        yield "", models[0]
+        return
+    for name, model in zip(names, models, strict=True):
+        yield f"{name}: ", model
+
+
+def _how_flown(flights: Sequence[Flight]) -> str:
+    """That flights by different controllers are compared by what they track: a better one leaves the model as it is."""
+    from trueflight.groundstation.reading.listing import controller_of
+
+    flown = [controller_of(flight) for flight in flights]
+    if len(set(flown)) < 2 or not all(flown):
+        return ""
+    return (
+        f"flown by {', '.join(flown)}: these errors are the model's, not the controllers'. How near each flight came "
+        f"to the linear behaviour: {shlex.join(['groundstation', 'track', *(f.origin for f in flights)])}"
+    )
 
 
 def _written(save: Path | None, output: Path | None) -> dict[str, Any]:
@@ -178,7 +208,8 @@ def where_command(
     from trueflight.groundstation.versions.choice import choose_model
 
     read = read_flight(flight, vehicle, mapping)
-    result = compare(read, choose_model(read, model, store, effects), bandwidth, horizons=False)
+    chosen = choose_model(read, model, store, effects)
+    result = compare(read, chosen, bandwidth, horizons=False)
     where = where_it_fails(result)
     if save is not None:
         from trueflight.groundstation.views import write_where
@@ -188,5 +219,6 @@ def where_command(
         table = {"model": result.label, "rms": result.rms, **where_table(where)}
         print_json({**table, "recording": None if save is None else str(save)})
         return
+    print_start(console, chosen, AGAINST)
     print_where(console, where)
     print_written(console, save, None)

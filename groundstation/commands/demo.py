@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
+from rich.markup import escape
 
 from trueflight.models.shipped import QUAD5
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.results import Comparison, Diagnosis, WaterfallStep, WhereItFails
     from trueflight.groundstation.study.demonstration import Outcome
 
-console = Console()
+console = Terminal()
+LINE = 100
+"""Most columns of the line above a step."""
 # Resolved: the samples lie beside the folders, not beside the links to them.
 SAMPLES = Path(__file__).resolve().parents[2] / "samples" / "crazyflie"
 
@@ -88,8 +91,8 @@ class _Terminal:
 
     def step(self, title: str, command: str) -> None:
         """A heading."""
-        console.print()
-        console.rule(f"[bold]{title}[/bold]  [dim]{command}[/dim]", align="left")
+        console.print("\n" + "─" * min(console.width, LINE), style="dim")
+        console.print(f"[bold]{title}[/bold]  [dim]{escape(command)}[/dim]", highlight=False)
 
     def busy(self, text: str) -> AbstractContextManager[object]:
         """A line that goes away."""
@@ -120,7 +123,7 @@ class _Terminal:
 
 
 def _print_outcome(o: Outcome) -> None:
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
     table = Table(show_header=True)
     for column, side in (
@@ -167,9 +170,8 @@ def _print_outcome(o: Outcome) -> None:
 
 
 def _print_real(found: Iterable[tuple[str, Diagnosis]]) -> None:
-    from rich.table import Table
-
     from trueflight.groundstation.output.tables import SAID, percent
+    from trueflight.models.terminal import Table
 
     table = Table()
     for column in ("flight, and what is known", "found", "share", "parameters, 95 % interval"):

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from trueflight.groundstation.commands.linked import linked
@@ -17,13 +16,14 @@ from trueflight.groundstation.commands.options import (
 from trueflight.groundstation.output.terminal import print_event, print_warning
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json_line
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.operate.link import Link
     from trueflight.groundstation.operate.settings import Settings
     from trueflight.models.record_pb2 import Event
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from trueflight.groundstation.commands.options import JsonOption
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.design.integral_design import IntegralLoop
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from trueflight.models.design import Design
     from trueflight.models.vehicle import Vehicle
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:
@@ -80,9 +80,8 @@ def design_command(
 def _print_loops(
     believed: Vehicle, design: Design, found: Sequence[Loop], integral: Sequence[IntegralLoop]
 ) -> None:
-    from rich.table import Table
-
     from trueflight.groundstation.design.linear_design import actuation
+    from trueflight.models.terminal import Table
 
     delay, lag = actuation(believed, design.rate)
     table = Table(title=f"{believed.name}: closed loop, step of the reference")
@@ -119,7 +118,7 @@ def _print_gains(design: Design) -> None:
 
 
 def _print_integral(integral: Sequence[IntegralLoop]) -> None:
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
     table = Table(title="with integral (lqr_integral), a constant disturbance and the distance to lqr, 1 m")
     for heading in ("loop", "gone after", "peak", "step, rms", "translation, rms"):

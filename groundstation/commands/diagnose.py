@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
@@ -26,8 +25,9 @@ from trueflight.groundstation.commands.options import (
 from trueflight.groundstation.output.terminal import print_written, working
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:

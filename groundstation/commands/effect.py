@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from trueflight.groundstation.commands.options import EffectsOption, JsonOption
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.models.effect import Effect
 
-console = Console()
+console = Terminal()
 effect_app = typer.Typer(no_args_is_help=True, help="Write an effect of your own.")
 
 
@@ -48,7 +48,7 @@ def effects_command(
 
 
 def _print_catalogue(effects: Sequence[Effect]) -> None:
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
     table = Table()
     table.add_column("effect", no_wrap=True)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from trueflight.groundstation.commands.options import (
@@ -18,12 +17,13 @@ from trueflight.groundstation.commands.options import (
 from trueflight.groundstation.output.terminal import print_notes, working
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.versions.vehicle_draft import Draft
     from trueflight.models.flight import Flight
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:
@@ -61,9 +61,9 @@ def flights_command(
 
 
 def _print_flights(rows: list[dict[str, Any]], directory: Path) -> None:
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
-    table = Table(caption=f"{len(rows)} files in {directory}", caption_justify="left")
+    table = Table(caption=f"{len(rows)} files in {directory}")
     table.add_column("flight", overflow="fold")
     table.add_column("date", no_wrap=True)
     for heading in ("length", "in air", "rate"):
@@ -186,9 +186,9 @@ def _check_import(
 
 
 def _print_draft(drafted: Draft, target: Path, file: Path) -> None:
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
-    table = Table(title=f"{escape(str(target))}: drafted from {escape(file.name)}", title_justify="left")
+    table = Table(title=f"{escape(str(target))}: drafted from {escape(file.name)}")
     table.add_column("value", overflow="fold")
     table.add_column("where it is from", overflow="fold")
     for line in drafted.lines:

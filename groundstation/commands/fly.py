@@ -19,13 +19,14 @@ from trueflight.groundstation.commands.options import (
 from trueflight.groundstation.output.terminal import print_event, print_warning
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json, print_json_line
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.operate.link import Link
     from trueflight.groundstation.operate.settings import Settings
     from trueflight.models.record_pb2 import Event
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:
@@ -101,7 +102,7 @@ def _list_trajectories(as_json: bool) -> None:
             }
         )
         return
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
     table = Table()
     table.add_column("trajectory", no_wrap=True)

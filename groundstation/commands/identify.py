@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
@@ -18,11 +17,12 @@ from trueflight.groundstation.commands.options import (
     ValidateOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import working
+from trueflight.groundstation.output.terminal import print_start, working
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:
@@ -71,4 +71,5 @@ def identify_command(
     if as_json:
         print_json(identified_table(found))
         return
+    print_start(console, start)
     print_identified(console, found)

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from trueflight.models.access import ENGINEER, OBSERVER, OPERATOR
 from trueflight.models.printed import print_json_line
+from trueflight.models.terminal import Terminal
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from trueflight.groundstation.commands.correction import CORRECTIONS, ONNX, export_correction
@@ -24,15 +23,16 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import print_written, working
+from trueflight.groundstation.output.terminal import print_start, print_written, working
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.models.flight import Flight
     from trueflight.models.model import Model
 
-console = Console()
+console = Terminal()
 model_app = typer.Typer(no_args_is_help=True, help="Make, list, show and export model versions.")
 
 
@@ -125,6 +125,7 @@ def model_add(
             }
         )
         return
+    print_start(console, base)
     print_waterfall(console, steps, read.name, None if held_out is None else held_out.name)
     _print_added(made, base)
     for name, course in told.courses.items():
@@ -175,12 +176,11 @@ def model_list(
 
     Example: groundstation model list quad5
     """
-    from rich.table import Table
-
     from trueflight.groundstation.output.as_json import model_table
     from trueflight.groundstation.output.tables import fit_rms
     from trueflight.groundstation.versions.store import versions
     from trueflight.models.model import read_model
+    from trueflight.models.terminal import Table
 
     if not store.is_dir():
         raise InputError(

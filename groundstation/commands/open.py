@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
@@ -16,11 +15,12 @@ from trueflight.groundstation.commands.options import (
     VehicleOption,
 )
 from trueflight.models.errors import InputError
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.workbench.tasks import Source
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
@@ -17,15 +16,16 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import working
+from trueflight.groundstation.output.terminal import print_start, working
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 from trueflight.models.whole_file import write_whole
 
 if TYPE_CHECKING:
     from trueflight.groundstation.identify.planning import FlightPlan
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:
@@ -91,11 +91,13 @@ def plan_command(
     if as_json:
         print_json(plan_table(plan, output))
         return
+    if diagnosis is not None:
+        print_start(console, diagnosis.base)
     _print(plan, output)
 
 
 def _print(plan: FlightPlan, output: Path) -> None:
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
     low, high = plan.trajectory.bounds
     console.print(
@@ -106,9 +108,7 @@ def _print(plan: FlightPlan, output: Path) -> None:
     )
     for text in plan.manoeuvres:
         console.print(f"  {text}", highlight=False)
-    table = Table(
-        title="what it will tell (evidence above 6 tells two explanations apart)", title_justify="left"
-    )
+    table = Table(title="what it will tell (evidence above 6 tells two explanations apart)")
     for column in ("if it is", "and not", "evidence so far", "expected", ""):
         table.add_column(column, justify="right" if column[:1] == "e" else "left")
     for q in plan.questions:
@@ -120,7 +120,7 @@ def _print(plan: FlightPlan, output: Path) -> None:
             "[green]told apart[/green]" if q.answered else "[red]stays open[/red]",
         )
     console.print(table)
-    table = Table(title="half width of the 95 % intervals", title_justify="left")
+    table = Table(title="half width of the 95 % intervals")
     for column in ("effect", "parameter", "size planned for", "so far", "expected"):
         table.add_column(column, justify="left" if column in ("effect", "parameter") else "right")
     for p in plan.precision:

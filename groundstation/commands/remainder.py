@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from trueflight.groundstation.commands.options import (
     DEFAULT_STORE,
@@ -19,14 +18,15 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import working
+from trueflight.groundstation.output.terminal import print_start, working
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.results import Diagnosis, Unexplained
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:
@@ -88,11 +88,11 @@ ABOVE_NOISE = 1.25
 
 
 def _print(left: Unexplained, d: Diagnosis, path: Path | None, flight: Path) -> None:
-    from rich.table import Table
-
     from trueflight.groundstation.identify.sparse import written
     from trueflight.groundstation.output.tables import percent
+    from trueflight.models.terminal import Table
 
+    print_start(console, d.base)
     console.print(
         f"{d.flight.name}: explained by {', '.join(d.model.names())}; left are {d.rms_after:.3f} m/s² "
         f"(noise floor {d.noise_floor:.3f})",
@@ -122,7 +122,7 @@ def _print(left: Unexplained, d: Diagnosis, path: Path | None, flight: Path) -> 
     for start, end, share in left.moments:
         console.print(f"  {start:6.1f} to {end:.1f} s  {percent(share)} of it", highlight=False)
     if left.lines:
-        table = Table(title="lines of the spectrum", title_justify="left")
+        table = Table(title="lines of the spectrum")
         for column in ("Hz", "axis", "RMS m/s²", "what it may be"):
             table.add_column(column, justify="left" if column.startswith(("a", "w")) else "right")
         for line in left.lines:

@@ -11,20 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from trueflight.groundstation.commands.options import JobsOption, JsonOption, SaveOption
 from trueflight.groundstation.output.terminal import counted, print_written
 from trueflight.models.printed import print_json
 from trueflight.models.shipped import QUAD5
+from trueflight.models.terminal import Table, Terminal
 
 if TYPE_CHECKING:
     import numpy as np
 
     from trueflight.groundstation.study.reproduce import Prepared, Scenario, Study
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:

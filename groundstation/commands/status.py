@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from trueflight.groundstation.commands.linked import linked
@@ -15,11 +14,12 @@ from trueflight.groundstation.commands.options import (
 from trueflight.groundstation.output.terminal import print_warning
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.operate.settings import Settings
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:
@@ -72,7 +72,7 @@ def status_command(
 
 
 def _print_status(status: dict[str, Any], records: int) -> None:
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     ready = (

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from trueflight.groundstation.commands.options import (
     EffectsOption,
@@ -19,11 +18,12 @@ from trueflight.groundstation.commands.options import (
 from trueflight.groundstation.output.terminal import counted
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     pass
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:

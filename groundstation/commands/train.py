@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from trueflight.groundstation.commands.options import (
@@ -22,9 +21,10 @@ from trueflight.groundstation.commands.options import (
     StoreOption,
     VehicleOption,
 )
-from trueflight.groundstation.output.terminal import print_written
+from trueflight.groundstation.output.terminal import print_start, print_written
 from trueflight.models.errors import InputError
 from trueflight.models.printed import print_json
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.learn.ablation import Ablation
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from trueflight.models.flight import Flight
     from trueflight.models.model import Model
 
-console = Console()
+console = Terminal()
+BESIDE = "what is left by"
 
 FlightsArgument = Annotated[
     list[Path], typer.Argument(help="Flights, or folders of them: MCAP records, CSV, Parquet, PX4 ULogs.")
@@ -113,6 +114,7 @@ def train_command(
         table = training_table(made, done, samples, path)
         print_json({**table, "recording": None if save is None else str(save)})
         return
+    print_start(console, base, BESIDE)
     _print_training(done, samples, base)
     console.print(f"model version: {path}", highlight=False)
     print_written(console, save)
@@ -172,6 +174,7 @@ def ablate_command(
             plain({**asdict(result), "recipe": chosen.name, "recording": None if save is None else str(save)})
         )
         return
+    print_start(console, base, BESIDE)
     _print_ablation(result)
     print_written(console, save)
 
@@ -250,12 +253,11 @@ def _bar(what: str, total: int) -> Iterator[Callable[[int, str], None]]:
 
 
 def _print_training(done: Training, samples: Samples, base: Model) -> None:
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
     network, fit = done.network, done.network.fit
     table = Table(
         title=f"{network.label} beside {base.with_network(None).label}: remainder on held-out blocks, RMS in m/s²",
-        title_justify="left",
     )
     for column in ("axis", "before", "with network", "noise floor"):
         table.add_column(column, justify="left" if column == "axis" else "right")
@@ -310,12 +312,11 @@ def _print_remarks(done: Training, samples: Samples, base: Model) -> None:
 
 
 def _print_ablation(result: Ablation) -> None:
-    from rich.table import Table
+    from trueflight.models.terminal import Table
 
     table = Table(
         title=f"remainder on held-out blocks, RMS in m/s²: {result.before_rms:.4f} without a network, noise floor "
         f"{result.noise_floor:.4f}",
-        title_justify="left",
     )
     for column in ("layers", "numbers", "trained", "held out", "kB", "µs", "s", ""):
         table.add_column(column, justify="left" if column in ("layers", "") else "right", no_wrap=True)
@@ -337,7 +338,6 @@ def _print_ablation(result: Ablation) -> None:
         return
     table = Table(
         title=f"what each feature is worth to {result.reference} ({result.reference_rms:.4f} m/s²)",
-        title_justify="left",
     )
     for column in ("feature", "shuffled", "trained without"):
         table.add_column(column, justify="left" if column == "feature" else "right")

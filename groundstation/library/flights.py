@@ -67,9 +67,10 @@ class Flight(columns.Flight):
 
     def _print(self, console: Console) -> None:
         from rich.markup import escape as plain
-        from rich.table import Table
 
-        table = Table(title=plain(f"{self.name}: {self._size()}"), title_justify="left")
+        from trueflight.models.terminal import Table
+
+        table = Table(title=plain(f"{self.name}: {self._size()}"))
         for heading in ("column", "shape", "unit", "what"):
             table.add_column(heading)
         for name in self._recorded():

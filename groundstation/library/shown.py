@@ -43,9 +43,9 @@ class Summary:
 
 def summary_of(show: Callable[[Console], None]) -> Summary:
     """The summary that `show` prints on a console of `WIDTH` columns."""
-    from rich.console import Console
+    from trueflight.models.terminal import Terminal
 
-    console = Console(
+    console = Terminal(
         width=WIDTH,
         record=True,
         file=io.StringIO(),

@@ -368,6 +368,7 @@ def model_table(model: Model) -> dict[str, Any]:
             "created": model.created,
             "data_hash": model.data_hash,
             "fit": dict(model.fit),
+            "fitted_to": list(model.fitted_to),
             "network": None if model.network is None else network_summary(model.network),
         }
     )

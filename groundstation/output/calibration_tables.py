@@ -1,4 +1,4 @@
-"""What a study of the diagnosis looks like in a terminal of 100 columns."""
+"""What a study of the diagnosis looks like in a terminal."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from trueflight.groundstation.evaluate.calibration import NOTHING, OUTCOMES, Calibration, Proportion
+from trueflight.models.terminal import Table
 
 SHOWN = 30
 """Wrong flights in the table of a terminal; all are in the page and in what `--json` gives."""
@@ -31,7 +31,7 @@ def print_calibration(console: Console, result: Calibration, folder: Path) -> No
 
 
 def _print_shares(console: Console, result: Calibration) -> None:
-    table = Table(title="how often it was right, with 95 % intervals", title_justify="left")
+    table = Table(title="how often it was right, with 95 % intervals")
     table.add_column("")
     table.add_column("flights", justify="right")
     table.add_column("share", justify="right", no_wrap=True)
@@ -50,7 +50,7 @@ def _print_shares(console: Console, result: Calibration) -> None:
 
 
 def _print_groups(console: Console, result: Calibration) -> None:
-    table = Table(title="right, or in a group", title_justify="left")
+    table = Table(title="right, or in a group")
     table.add_column("by")
     table.add_column("")
     table.add_column("flights", justify="right")
@@ -63,7 +63,7 @@ def _print_groups(console: Console, result: Calibration) -> None:
 
 
 def _print_hidden(console: Console, result: Calibration) -> None:
-    table = Table(title="what became of the hidden effects", title_justify="left")
+    table = Table(title="what became of the hidden effects")
     table.add_column("hidden", no_wrap=True)
     for heading in ("times", "missing", "in a\ngroup", "not\nexcited", "denied"):
         table.add_column(heading, justify="right")
@@ -80,7 +80,7 @@ def _print_hidden(console: Console, result: Calibration) -> None:
 
 
 def _print_coverage(console: Console, result: Calibration) -> None:
-    table = Table(title="95 % intervals that hold the truth", title_justify="left")
+    table = Table(title="95 % intervals that hold the truth")
     table.add_column("parameter", no_wrap=True)
     for heading in ("intervals", "hold it", "95 % need them\nwider by", "error,\nmedian"):
         table.add_column(heading, justify="right")
@@ -98,7 +98,7 @@ def _print_coverage(console: Console, result: Calibration) -> None:
 
 
 def _print_certainty(console: Console, result: Calibration) -> None:
-    table = Table(title="how sure verdicts are, and how often they are right", title_justify="left")
+    table = Table(title="how sure verdicts are, and how often they are right")
     table.add_column("verdict")
     table.add_column("says it is sure", justify="right")
     table.add_column("verdicts", justify="right")
@@ -115,7 +115,7 @@ def _print_certainty(console: Console, result: Calibration) -> None:
 
 
 def _print_wrong(console: Console, result: Calibration) -> None:
-    table = Table(title=f"what was wrong ({len(result.wrong)})", title_justify="left")
+    table = Table(title=f"what was wrong ({len(result.wrong)})")
     table.add_column("flight", justify="right")
     table.add_column("hidden")
     table.add_column("why")

@@ -1,4 +1,4 @@
-"""What tracking and the tube of a flight look like in a terminal of 100 columns."""
+"""What tracking and the tube of a flight look like in a terminal."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Literal
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from trueflight.groundstation.evaluate.bound import Tube
 from trueflight.groundstation.evaluate.tracking import Tracking
+from trueflight.models.terminal import Table
 
 MOST_LEAVINGS = 8
 PARTS: tuple[Literal["total", "model", "attitude"], ...] = ("total", "model", "attitude")

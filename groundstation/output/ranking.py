@@ -8,15 +8,15 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 from rich.text import Text
 
 from trueflight.groundstation.output.several_tables import print_several
 from trueflight.groundstation.output.tables import SAID, VERDICT_STYLE, percent
+from trueflight.groundstation.output.terminal import print_start
 from trueflight.groundstation.results import Diagnosis, EffectVerdict, Gusts
-from trueflight.models.effects import EXACT_ROTATION, effect_named
+from trueflight.models.effects import effect_named
 from trueflight.models.errors import InputError
-from trueflight.models.model import Model
+from trueflight.models.terminal import Table
 
 SHOWN = ("missing", "possible")
 """Verdicts that are always told in full."""
@@ -28,6 +28,7 @@ def print_diagnosis(
     """The ranking of effects, the residual before and after, and the next step as a command that can be pasted; with
     `everything` all that was looked for. `validate` is the held-out flight's file."""
     console.print(Text(_headline(d), style="bold" if d.named("missing") else "bold green"))
+    print_start(console, d.base)
     _print_effects(console, d, everything)
     _print_figures(console, d)
     for names in d.alternatives:
@@ -69,19 +70,12 @@ def next_command(d: Diagnosis, validate: Path | None = None) -> str:
 
 def _headline(d: Diagnosis) -> str:
     name = d.flight.name if not d.flights else f"{len(d.flights)} flights of {d.flight.vehicle.name}"
-    start = f", starting from {_contents(d.base)}" if d.base.version else ""
     missing, possible = d.named("missing"), d.named("possible")
     if missing:
-        return f"{name}: {' and '.join(missing)} missing{start}"
+        return f"{name}: {' and '.join(missing)} missing"
     if possible:
-        return f"{name}: nothing is surely missing, {' or '.join(possible)} may be{start}"
-    return f"{name}: nothing is missing that this flight could show{start}"
-
-
-def _contents(model: Model) -> str:
-    added = [n for n in model.names() if n != EXACT_ROTATION.name]
-    added += [] if model.network is None else [model.network.label]
-    return f"v{model.version} ({', '.join(added)})"
+        return f"{name}: nothing is surely missing, {' or '.join(possible)} may be"
+    return f"{name}: nothing is missing that this flight could show"
 
 
 def _print_effects(console: Console, d: Diagnosis, everything: bool) -> None:

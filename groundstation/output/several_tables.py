@@ -1,4 +1,4 @@
-"""What several flights of one vehicle say together, in a terminal of 100 columns."""
+"""What several flights of one vehicle say together, in a terminal."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from trueflight.groundstation.results import Diagnosis, ParameterEstimate, SharedNumber
+from trueflight.models.terminal import Table
 
 
 def print_several(console: Console, d: Diagnosis) -> None:
     """Each flight's residual and own numbers, and the vehicle's numbers that differ between the flights."""
-    table = Table(title="each flight", title_justify="left")
+    table = Table(title="each flight")
     table.add_column("flight", overflow="fold")
     table.add_column("m/s²", justify="right", no_wrap=True)
     table.add_column("noise\nfloor", justify="right", no_wrap=True)

@@ -1,4 +1,4 @@
-"""What a survey of many flights looks like in a terminal of 100 columns."""
+"""What a survey of many flights looks like in a terminal."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from trueflight.groundstation.evaluate.history import History
 from trueflight.groundstation.evaluate.survey import Fleet, Row
 from trueflight.groundstation.output.tables import percent
+from trueflight.models.terminal import Table
 
 SHOWN = 40
 """Flights in the table of a terminal; all are in what `--save` and `--json` give."""
@@ -52,7 +52,7 @@ def _print_history(console: Console, h: History) -> None:
 
 def _print_flights(console: Console, rows: Sequence[Row], folder: Path) -> None:
     root = folder.resolve()
-    table = Table(title=f"{folder}: {len(rows)} flights", title_justify="left")
+    table = Table(title=f"{folder}: {len(rows)} flights")
     table.add_column("flight", overflow="fold")
     table.add_column("vehicle")
     table.add_column("m/s²", justify="right", no_wrap=True)
@@ -77,7 +77,7 @@ def _print_flights(console: Console, rows: Sequence[Row], folder: Path) -> None:
 
 
 def _print_effects(console: Console, fleet: Fleet) -> None:
-    table = Table(title="how often each effect is missing", title_justify="left")
+    table = Table(title="how often each effect is missing")
     for column in (
         "effect",
         "missing",
@@ -102,7 +102,7 @@ def _print_effects(console: Console, fleet: Fleet) -> None:
 
 
 def _print_parameters(console: Console, fleet: Fleet) -> None:
-    table = Table(title="parameters: mean, standard deviations, trend", title_justify="left")
+    table = Table(title="parameters: mean, standard deviations, trend")
     for column in ("parameter", "flights", "mean", "vehicles", "flights", "of a fit", "trend a day"):
         table.add_column(column, justify="left" if column == "parameter" else "right")
     for s in fleet.parameters:

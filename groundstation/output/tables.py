@@ -1,4 +1,4 @@
-"""What the analyses look like in a terminal of 100 columns."""
+"""What the analyses look like in a terminal."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 from rich.text import Text
 
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.results import Comparison, IdentifiedVehicle, WaterfallStep, WhereItFails
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model
+from trueflight.models.terminal import Table
 
 VERDICT_STYLE = {
     "missing": "bold red",
@@ -47,7 +47,6 @@ def print_comparisons(console: Console, comparisons: Sequence[Comparison]) -> No
     table = Table(
         title=f"{first.flight.name}: measured minus predicted acceleration, RMS in m/s², heading frame, "
         f"below {first.bandwidth:g} Hz",
-        title_justify="left",
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),  # whole on 80 columns
         pad_edge=False,
@@ -108,7 +107,7 @@ def print_waterfall(
     console: Console, steps: Sequence[WaterfallStep], fitted: str, held_out: str | None
 ) -> None:
     """The error falling over the model versions, with bars."""
-    table = Table(title="residual RMS in m/s² as effects are added", title_justify="left")
+    table = Table(title="residual RMS in m/s² as effects are added")
     table.add_column("model", no_wrap=True)
     table.add_column(f"fitted: {fitted}", justify="right", overflow="fold")
     if held_out:
@@ -131,7 +130,6 @@ def print_side_by_side(console: Console, beside: SideBySide) -> None:
     table = Table(
         title="measured minus predicted acceleration, RMS in m/s², heading frame, "
         f"below {first.bandwidth:g} Hz",
-        title_justify="left",
     )
     table.add_column("", overflow="fold")
     axes = [a.axis for a in first.axes]
@@ -185,7 +183,7 @@ def fit_rms(model: Model) -> float:
 def print_identified(console: Console, found: IdentifiedVehicle) -> None:
     """The vehicle's numbers as each flight shows them, and how well its full state is predicted."""
     for each in found.numbers:
-        table = Table(title=f"{each.flight}: the vehicle's numbers", title_justify="left")
+        table = Table(title=f"{each.flight}: the vehicle's numbers")
         for head in ("number", "95 % interval", "believed", "rests on"):
             table.add_column(head, no_wrap=head != "rests on")
         for n in each.numbers:
@@ -208,7 +206,7 @@ def print_identified(console: Console, found: IdentifiedVehicle) -> None:
             "the full state is not predicted: it needs position, velocity, attitude and a second of flight"
         )
         return
-    table = Table(title="full state predicted, mean error", title_justify="left")
+    table = Table(title="full state predicted, mean error")
     for head in ("flight", "after", "position m", "velocity m/s", "attitude rad", "rate rad/s"):
         table.add_column(head, justify="left" if head == "flight" else "right")
     for state, name in [(f, f.flight) for f in found.fitted] + (

@@ -11,8 +11,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from trueflight.models.terminal import Terminal
+
 if TYPE_CHECKING:
     from trueflight.models.flight import Flight
+    from trueflight.models.model import Model
     from trueflight.models.record_pb2 import Event
 
 
@@ -22,6 +25,25 @@ def print_written(console: Console, recording: Path | None, report: Path | None 
         console.print(f"Rerun recording: {recording}")
     if report is not None:
         console.print(f"report: {report}")
+
+
+def print_start(console: Console, model: Model, role: str = "starting from") -> None:
+    """From which model a command begins."""
+    console.print(f"{role} {contents_of(model)}", style="dim", highlight=False, markup=False)
+
+
+def contents_of(model: Model) -> str:
+    """A model in words: its version, what it holds, and what it was fitted to."""
+    from trueflight.models.effects import EXACT_ROTATION
+
+    holds = [n for n in model.names() if n != EXACT_ROTATION.name]
+    holds += [] if model.network is None else [model.network.label]
+    turns = " with exact rotation of thrust" if model.rotates_exactly else ""
+    words = f"v{model.version} " if model.version else ""
+    words += f"({', '.join(holds)})" if holds else f"the linear model{turns}"
+    if model.fitted_to:
+        words += f", fitted to {' and '.join(model.fitted_to)}"
+    return words + (f"; effects of your own in {model.effects_directory}" if model.effects_directory else "")
 
 
 STYLES = {"warning": "yellow", "error": "red"}
@@ -35,7 +57,7 @@ def print_event(console: Console, event: Event) -> None:
 def print_warning(warning: str) -> None:
     """In red, beside what is printed: that anybody on the network could do the same; nothing of an empty text."""
     if warning:
-        Console(stderr=True).print(f"[bold red]{escape(warning)}[/] (groundstation keys)", highlight=False)
+        Terminal(stderr=True).print(f"[bold red]{escape(warning)}[/] (groundstation keys)", highlight=False)
 
 
 def print_notes(console: Console, flight: Flight) -> None:
@@ -61,7 +83,7 @@ def counted(quiet: bool) -> Progress:
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=Terminal(stderr=True),
         disable=quiet,
         transient=True,
     )

@@ -9,6 +9,7 @@ from typing import Any
 from trueflight.groundstation.reading.flight_file import read_flight
 from trueflight.groundstation.reading.ros_bag import is_ros_bag
 from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
 from trueflight.models.record import read_record
 
 SENSORS = {
@@ -50,6 +51,14 @@ def flight_row(file: Path, directory: Path) -> dict[str, Any]:
         "measured": [word for name, word in SENSORS.items() if flight.has(name)],
         "notes": list(flight.notes),
     }
+
+
+def controller_of(flight: Flight) -> str:
+    """Which controller flew, where a record of the companion tells; '' otherwise."""
+    record = Path(flight.origin)
+    if record.suffix.lower() != ".mcap" or not record.is_file() or is_ros_bag(record):
+        return ""
+    return str(read_record(record, ticks=False).metadata.get("controller", ""))
 
 
 def _record_facts(file: Path) -> dict[str, Any]:

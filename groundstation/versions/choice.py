@@ -33,7 +33,7 @@ def choose_model(
     """
     directory = None if effects is None else str(effects)
     if which == "linear":
-        return linear_model(flight.vehicle)
+        return replace(linear_model(flight.vehicle), effects_directory=directory)
     model: Model | None
     if isinstance(which, Model):
         model = which

@@ -149,7 +149,7 @@ def _made(
     rms = float((here.sse / here.residual.size) ** 0.5)
     hashes = "+".join(f.data_hash for f in flights)
     return Made(
-        replace(model.with_terms(terms), data_hash=hashes, fit={"rms": rms}),
+        replace(model.with_terms(terms), data_hash=hashes, fit={"rms": rms}, fitted_to=tuple(names)),
         own,
         tuple(fitted_anew(n, here, names) for n in differing),
     )

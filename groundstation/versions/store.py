@@ -165,4 +165,6 @@ def refit(model: Model, flights: Sequence[Flight], bandwidth: float | None = Non
     fitted = fit(problem, model.terms)
     rms = float((fitted.sse / fitted.residual.size) ** 0.5)
     hashes = "+".join(f.data_hash for f in flights)
-    return replace(model_of(fitted, model), data_hash=hashes, fit={"rms": rms})
+    return replace(
+        model_of(fitted, model), data_hash=hashes, fit={"rms": rms}, fitted_to=tuple(f.name for f in flights)
+    )

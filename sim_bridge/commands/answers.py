@@ -74,8 +74,7 @@ def effects(as_json: Json = False) -> None:
     if as_json:
         tell({"effects": rows}, "", as_json)
         return
-    from rich.console import Console
-    from rich.table import Table
+    from trueflight.models.terminal import Table, Terminal
 
     table = Table()
     for column in ("effect", "drawn", "in rich", "unit", "what"):
@@ -84,4 +83,4 @@ def effects(as_json: Json = False) -> None:
         span = f"{row['low']:g} to {row['high']:g}"
         rich = "{:g} to {:g}".format(*row["rich"]) if row["rich"] else ""
         table.add_row(row["name"], span, rich, row["unit"], row["what"])
-    Console(width=100).print(table)
+    Terminal().print(table)

@@ -95,8 +95,7 @@ def collect(
 
 def _print_collected(entries: list[dict[str, Any]]) -> None:
     """One row for each trajectory: how often, how long, how far from the reference."""
-    from rich.console import Console
-    from rich.table import Table
+    from trueflight.models.terminal import Table, Terminal
 
     table = Table()
     for column in ("trajectory", "flights", "s", "charge", "RMS x, y, z (m)", "on ground", "not finished"):
@@ -118,4 +117,4 @@ def _print_collected(entries: list[dict[str, Any]]) -> None:
             f"{sum(entry['ticks_on_ground'] for entry in of) / ticks:.1%}",
             str(sum(entry["outcome"] != "finished" for entry in of) or ""),
         )
-    Console(width=100).print(table)
+    Terminal().print(table)

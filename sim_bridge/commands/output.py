@@ -37,9 +37,10 @@ class Progress:
         # A hundred fly in a second: below that a bar would only flicker.
         if seconds > 100.0 and not quiet and sys.stderr.isatty():
             from rich import progress
-            from rich.console import Console
 
-            self._bar = progress.Progress(console=Console(stderr=True), transient=True)
+            from trueflight.models.terminal import Terminal
+
+            self._bar = progress.Progress(console=Terminal(stderr=True), transient=True)
 
     def __enter__(self) -> Progress:
         if self._bar is not None:

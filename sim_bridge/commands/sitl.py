@@ -82,9 +82,9 @@ class _Teller:
         self._status: Any = None
         self._told = 0.0
         if not as_json and sys.stderr.isatty():
-            from rich.console import Console
+            from trueflight.models.terminal import Terminal
 
-            self._status = Console(stderr=True).status("")
+            self._status = Terminal(stderr=True).status("")
 
     def __enter__(self) -> _Teller:
         if self._status is not None:
@@ -113,9 +113,7 @@ class _Teller:
         """What PX4's control allocation must be for a vehicle, beside what PX4 has: a table, for people."""
         if self._as_json:
             return
-        from rich.console import Console
-        from rich.table import Table
-
+        from trueflight.models.terminal import Table, Terminal
         from trueflight.sim_bridge.sitl.allocation import expected_parameters
 
         table = Table()
@@ -125,7 +123,7 @@ class _Teller:
         for one in expected_parameters(vehicle):
             has = f"{values[one.name]:.4g}" if one.name in values else "not told"
             table.add_row(one.name, f"{one.value:.4g}", has, one.what)
-        Console(width=100).print(table)
+        Terminal().print(table)
 
     def live(self, text: str) -> None:
         """What is going on, on a terminal's last line, twice a second."""

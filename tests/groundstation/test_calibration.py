@@ -1,5 +1,6 @@
 """A study of calibration counts what it says it counts, and flies what it says it flies."""
 
+import io
 import json
 import math
 import re
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from json_schemas import valid
 from simulated import VEHICLE
+from widths import whole_at_every_width
 
 from trueflight.groundstation.commands.app import app
 from trueflight.groundstation.evaluate.calibration import (
@@ -30,6 +32,7 @@ from trueflight.groundstation.evaluate.calibration import (
     wrongs,
 )
 from trueflight.groundstation.output.as_json import calibration_table
+from trueflight.groundstation.output.calibration_tables import print_calibration
 from trueflight.groundstation.report.calibration import CHARTS, render_calibration
 from trueflight.groundstation.study.calibration_study import (
     STRENGTHS,
@@ -47,6 +50,7 @@ from trueflight.models.effects import catalogue
 from trueflight.models.errors import run_command_line
 from trueflight.models.flight import Flight
 from trueflight.models.reference import trajectory_from_csv
+from trueflight.models.terminal import Terminal
 from trueflight.models.vehicle import load_vehicle
 from trueflight.sim_bridge.truth.effects import EFFECTS
 
@@ -446,6 +450,14 @@ def test_every_number_of_the_page_stands_in_the_table() -> None:
     assert page.count("<svg") == len(CHARTS)
     assert "http://" not in re.sub(r'xmlns(:xlink)?="[^"]+"', "", page)
     assert "com_offset named instead of wind" in page
+
+
+def test_every_number_is_whole_in_a_terminal(tmp_path: Path) -> None:
+    drag = replace(FOUND.said[0], estimates=(Estimated("x", 0.3, 0.2, 0.4, 0.31),))
+    with whole_at_every_width() as tables:
+        cases = (*EVERY, replace(FOUND, said=(drag, *FOUND.said[1:])))
+        print_calibration(Terminal(file=io.StringIO()), calibrate(cases), tmp_path)
+    assert len(tables) == 6
 
 
 def test_page_of_a_study_that_found_nothing_to_tell() -> None:

@@ -9,6 +9,7 @@ import pytest
 from json_schemas import valid
 from pyarrow import parquet
 from simulated import VEHICLE
+from widths import whole_at_every_width
 
 from trueflight.groundstation.commands.app import app
 from trueflight.groundstation.evaluate.survey import (
@@ -53,7 +54,7 @@ def folder(tmp_path_factory):
 
 def run(capsys, monkeypatch, *arguments) -> tuple[int, str, str]:
     monkeypatch.setattr("sys.argv", ["groundstation", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stopped:
+    with pytest.raises(SystemExit) as stopped, whole_at_every_width():
         run_command_line(app)
     told = capsys.readouterr()
     return int(stopped.value.code or 0), told.out, told.err
