@@ -228,7 +228,8 @@ def _write_record(plan: Plan, tick: _TickWriter, flown: Flown, path: Path) -> No
 def record_metadata(plan: Plan) -> dict[str, str]:
     """What a record tells of its flight; nothing of what is hidden."""
     parameters = {f"parameter.{key}": str(value) for key, value in plan.trajectory.parameters.items()}
-    return {"created_by": "sim-bridge", "trajectory": plan.trajectory.name, **parameters}
+    flown = {"trajectory": plan.trajectory.name, "controller": plan.controller}
+    return {"created_by": "sim-bridge", **flown, **parameters}
 
 
 def constant_tick(plan: Plan) -> Tick:

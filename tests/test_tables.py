@@ -4,6 +4,7 @@ makes them."""
 import ast
 import io
 import re
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
@@ -138,6 +139,11 @@ def test_flights_vehicles_and_keys(flown: Path, tmp_path: Path) -> None:
     shown("groundstation design", VEHICLE, "-o", tmp_path / "design.json")
     shown("groundstation track", record, record)
     shown("groundstation bound", record)
+    again = tmp_path / "again.mcap"
+    words = ("--vehicle", VEHICLE, "--trajectory", "lemniscate", "--controller", "lqr_integral", "-o", again)
+    shown("sim-bridge fly", *words)
+    told = shown("groundstation compare", record, again)
+    assert f"groundstation track {shlex.quote(str(record))} {again}" in told
     shown("groundstation keys", tmp_path / "keys", "--vehicle", "quad5", "--engineer", "anna")
     shown("groundstation effects")
     shown("groundstation effects", "rotor_drag")
@@ -156,13 +162,16 @@ def test_models_against_flights(flown: Path, tmp_path: Path) -> None:
     shown(
         "groundstation model add", "rotor_drag", "--flight", record, "--validate", flown / "table.csv", *store
     )
-    told = shown("groundstation compare", record, *store)
-    assert all(word in told for word in ("linear", "v1"))
-    shown("groundstation compare", record, flown / "table.csv", *store)
-    shown("groundstation compare", record, "--model", "linear", "--model", "v1", *store)
-    shown("groundstation where", record, *store)
-    shown("groundstation identify", record, *store)
-    shown("groundstation remainder", record, *store)
+    told = [
+        shown("groundstation diagnose", record, *store),
+        shown("groundstation compare", record, *store),
+        shown("groundstation compare", record, flown / "table.csv", *store),
+        shown("groundstation compare", record, "--model", "linear", "--model", "v1", *store),
+        shown("groundstation where", record, *store),
+        shown("groundstation identify", record, *store),
+        shown("groundstation remainder", record, *store),
+    ]
+    assert all(f"v1 (rotor_drag), fitted to {record.stem}\n" in text for text in told)
     shown("groundstation model list", *store)
     shown("groundstation model show", "1", *store)
     shown("groundstation model export", "1", "--to", "mujoco", "-o", tmp_path / "vehicle.xml", *store)

@@ -51,7 +51,7 @@ def test_template_is_ranked_fitted_added_and_exported(flight_with_tether: Path, 
     vehicle = flight_with_tether.with_suffix(".vehicle.toml")
     common = ("--vehicle", vehicle, "--effects", effects, "--store", store, "--json")
 
-    diagnosis = json.loads(run("diagnose", flight_with_tether, *common))
+    diagnosis = json.loads(run("diagnose", flight_with_tether, "--model", "linear", *common))
     (found,) = [e for e in diagnosis["effects"] if e["verdict"] in ("missing", "possible")]
     assert (found["name"], found["verdict"], found["rank"]) == ("tether", "missing", 1)
     pull = found["parameters"]["pull"]
