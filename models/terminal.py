@@ -10,6 +10,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
 from rich.console import Console, ConsoleDimensions, ConsoleOptions, RenderResult
+from rich.segment import Segment
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -76,7 +77,7 @@ class Table(RichTable):
                 for column, width in zip(laid.columns, widths, strict=True):
                     column.width, column.min_width, column.max_width = width, None, None
                     column.overflow = "fold"
-                yield from RichTable.__rich_console__(laid, console, options)
+                yield from _without_ends(RichTable.__rich_console__(laid, console, options), console, options)
                 break
         else:
             yield from _stacked(told, console, options.max_width)
@@ -87,6 +88,20 @@ class Table(RichTable):
 def _said(console: Console, options: ConsoleOptions, told: Any, style: Any) -> Text:
     text = told if isinstance(told, Text) else console.render_str(str(told), style=style, highlight=False)
     return _whole(_wrapped(text, options.max_width))
+
+
+def _without_ends(drawn: RenderResult, console: Console, options: ConsoleOptions) -> Iterator[Segment]:
+    """The same without the blanks at the ends of lines, which a narrower window would break into lines of their own."""
+    plain = (
+        s for one in drawn for s in ([one] if isinstance(one, Segment) else console.render(one, options))
+    )
+    for line in Segment.split_lines(plain):
+        while line and not line[-1].text.strip():
+            line.pop()
+        if line:
+            *before, last = line
+            yield from [*before, Segment(last.text.rstrip(), last.style)]
+        yield Segment.line()
 
 
 def _cells(table: RichTable, console: Console) -> list[list[Text]]:

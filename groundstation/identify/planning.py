@@ -18,6 +18,7 @@ from trueflight.groundstation.identify.fitting import BLOCK
 from trueflight.groundstation.identify.information import Precision, Question, Study
 from trueflight.groundstation.identify.manoeuvres import Limits, Manoeuvre, as_flown, base_of, library
 from trueflight.groundstation.identify.questions import open_questions
+from trueflight.groundstation.identify.search import STRONG_EVIDENCE
 from trueflight.groundstation.results import Diagnosis
 from trueflight.models.design import Design
 from trueflight.models.effects import effect_named
@@ -69,6 +70,10 @@ def plan_flight(
     if diagnosis is not None and diagnosis.flight.battery_voltage is not None:
         voltage = float(np.median(diagnosis.flight.battery_voltage))
     before = None if diagnosis is None else study.information(diagnosis.flight)
+    if diagnosis is not None and before is not None and not between and not diagnosis.named("possible"):
+        questions = open_questions(diagnosis, (), effects_directory, _told_already(study, before))
+        study = Study(vehicle, questions, diagnosis, effects_directory)
+        before = study.information(diagnosis.flight)
     known = []
     for number, one in enumerate(manoeuvres, 1):
         progress(f"predicting manoeuvre {number} of {len(manoeuvres)}")
@@ -96,6 +101,19 @@ def plan_flight(
         ),
         questions.left_out,
     )
+
+
+def _told_already(study: Study, before: np.ndarray) -> dict[str, str]:
+    """What the flight at hand could not show beside its error, and yet tells: at the size planned for it would be
+    seen."""
+    found = {}
+    for i, j in study.questions.pairs:
+        if j is None and (evidence := study.evidence(before, i, None)) > STRONG_EVIDENCE:
+            found[study.candidates[i].names[-1]] = (
+                "this flight tells already that there is not as much of it as a plan looks for "
+                f"(evidence {evidence:.0f})"
+            )
+    return found
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -47,9 +47,13 @@ class OpenQuestions:
 
 
 def open_questions(
-    diagnosis: Diagnosis | None, between: Sequence[str], effects_directory: str | None
+    diagnosis: Diagnosis | None,
+    between: Sequence[str],
+    effects_directory: str | None,
+    told: Mapping[str, str] | None = None,
 ) -> OpenQuestions:
-    """The effects of `between` against one another; without them, what `diagnosis` left open.
+    """The effects of `between` against one another; without them, what `diagnosis` left open but for what
+    is `told`, with the reason.
 
     Raises `InputError` where nothing is open.
     """
@@ -60,7 +64,7 @@ def open_questions(
         n: "it is seen in the rotation, which this plan does not predict"
         for n in asked
         if known[n].rotational or not known[n].parameters
-    }
+    } | dict(told or {})
     names = tuple(n for n in dict.fromkeys(asked) if n not in left_out)
     if not names:
         reasons = "; ".join(f"{n}: {why}" for n, why in left_out.items())

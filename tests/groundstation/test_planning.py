@@ -1,5 +1,8 @@
 """A planned flight keeps its limits, says what it will tell, and tells it."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from simulated import VEHICLE, fly
@@ -13,6 +16,7 @@ from trueflight.models.model import rigid_body_model
 from trueflight.models.reference import trajectory, trajectory_from_csv
 from trueflight.models.vehicle import load_vehicle
 
+SAMPLES = Path(__file__).parents[2] / "samples"
 BELIEVED = load_vehicle(VEHICLE)
 DESIGN = load_design(VEHICLE.with_name("design.json"), BELIEVED)
 
@@ -88,6 +92,17 @@ def test_what_no_flight_within_the_limits_can_tell_stays_open() -> None:
     plan = plan_flight(DESIGN, BELIEVED, Limits(low=1.2), between=("ground_effect", "thrust_gain"))
     asked = next(q for q in plan.questions if q.one == ("ground_effect",) and q.other == ())
     assert not asked.answered
+
+
+def test_what_the_flight_tells_already_is_not_asked_again() -> None:
+    """The curve of thrust is too small a part of this flight's error to be judged there, and yet would have shown."""
+    flight = read_flight(SAMPLES / "rotorpy" / "rotor_drag" / "validate.parquet")
+    before = diagnose(flight, rigid_body_model(flight.vehicle))
+    assert "thrust_curve" in before.named("not_excited")
+    gains = replace(DESIGN, vehicle=flight.vehicle.name)
+    plan = plan_flight(gains, flight.vehicle, Limits(duration=10.0), before)
+    assert "tells already" in plan.left_out["thrust_curve"]
+    assert all(q.before is None or q.before < 6.0 for q in plan.questions)
 
 
 def test_nothing_open_is_said_in_one_line() -> None:
