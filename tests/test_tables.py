@@ -39,6 +39,7 @@ NO_TABLE = {
     "sim-bridge run": "that it is ready",
     "groundstation open": "the address of the page",
     "groundstation report": "where the page is",
+    "sim-bridge fly-many": "how many flights, where",
     "sim-bridge pilot": "the mode",
 }
 """Commands that print no table, and what they print."""

@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from trueflight.groundstation.commands.choosing import offer_sources
+from trueflight.groundstation.commands.picture import offer_pictures
 
 
 class Entry(NamedTuple):
@@ -166,6 +167,7 @@ class Loading(Mapping[str, TyperCommand | TyperGroup]):
             module = import_module(f"trueflight.groundstation.commands.{self._entries[name].module}")
             module.register(part)
             offer_sources(part)
+            offer_pictures(part)
             self._made |= typer.main.get_group(part).commands
         made: TyperCommand | TyperGroup = self._made[name]
         return made

@@ -29,9 +29,9 @@ class ErrorOverTime:
 
 
 def error_over_time(comparison: Comparison, smoothing: float, highest: float | None = None) -> ErrorOverTime:
-    """The residual of `comparison`, RMS over `smoothing` s; colours end at its 99th percentile unless told."""
+    """The residual of `comparison`, RMS over `smoothing` s; colours end at its greatest value unless told."""
     values = rolling_rms(comparison.residual, comparison.used, round(smoothing / comparison.flight.dt))
     finite = values[np.isfinite(values)]
     if highest is None:
-        highest = float(np.quantile(finite, 0.99)) if finite.size else 1.0
+        highest = float(finite.max()) if finite.size else 1.0
     return ErrorOverTime(comparison, values, highest, smoothing)

@@ -14,7 +14,7 @@ from trueflight.groundstation.output.as_json import analysis_table
 from trueflight.groundstation.output.cited import CitedValue, environment, sentences
 from trueflight.groundstation.views.bars import bar_groups
 from trueflight.groundstation.views.changes import changes_panel
-from trueflight.groundstation.views.colour import NEWEST, WARNING, Colour, of_version
+from trueflight.groundstation.views.colour import NEWEST, of_version
 from trueflight.groundstation.views.comparison import comparison_panel
 from trueflight.groundstation.views.error import error_curves, moments_log
 from trueflight.groundstation.views.recording import page, recording, text
@@ -59,16 +59,13 @@ def _verdict(stream: rr.RecordingStream, a: Analysis, table: dict[str, Any]) -> 
     text(stream, "verdict/words", "\n\n".join([f"## {words[0]}", *words[1:]]))
     text(stream, "verdict/ranking", markdown.get_template("ranking.md").render(t=told))
     text(stream, "verdict/about", markdown.get_template("about.md").render(t=told))
-    colours: tuple[Colour, ...] = (WARNING, NEWEST)
     ranked = [e for e in a.diagnosis.effects if e.rank]
     shares: list[rrb.View] = []
     if len(ranked) > 1:
-        groups = [
-            (e.name, colours[k % 2], [0.0] * k + [100 * e.variance_share] + [0.0] * (len(ranked) - 1 - k))
-            for k, e in enumerate(ranked)
-        ]
-        name = "share of the squared error, %: " + ", ".join(f"{k} {e.name}" for k, e in enumerate(ranked))
-        shares.append(bar_groups(stream, name, groups, "verdict/shares/"))
+        share: list[float | None] = [100 * e.variance_share for e in ranked]
+        name = "share of the squared error, %"
+        groups = [("share", NEWEST, share)]
+        shares.append(bar_groups(stream, name, [e.name for e in ranked], groups, "verdict/shares/"))
     versions = [
         (c.label, error_over_time(c, SMOOTHING), of_version(k, 2))
         for k, c in enumerate((a.before, a.after) if a.after is not a.before else (a.before,))
@@ -91,7 +88,7 @@ def _verdict(stream: rr.RecordingStream, a: Analysis, table: dict[str, Any]) -> 
             curves,
             marks,
             *(() if changes is None else (changes,)),
-            row_shares=[3, 3, 1.5] if changes is None else [3, 3, 1.5, 4],
+            row_shares=[3, 3, 1.5] if changes is None else [2.6, 2.4, 1.8, 4.3],
         ),
         column_shares=[1, 1],
         name="verdict",

@@ -13,7 +13,7 @@ from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.results import Comparison, WhereItFails
 from trueflight.groundstation.views.colour import MEASURED, of_version
 from trueflight.groundstation.views.error import error_curves
-from trueflight.groundstation.views.recording import between, curve, page, recording, text
+from trueflight.groundstation.views.recording import between, curve, page, readable, recording, text
 
 AXES = ("forward", "left", "up")
 WINDOW = 15.0
@@ -84,7 +84,7 @@ def acceleration_views(
                 origin=at,
                 name=f"{name} ({AXES[axis]}) acceleration, m/s², below {comparisons[0].bandwidth:g} Hz",
                 axis_x=rrb.TimeAxis(view_range=between(start, min(start + WINDOW, float(flight.t[-1])))),
-                axis_y=rrb.ScalarAxis(range=_range(values, flight.t, start)),
+                axis_y=rrb.ScalarAxis(range=_range(values, flight.t, start, 700.0 / len(shown))),
                 plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=axis == shown[0]),
             )
         )
@@ -106,14 +106,13 @@ def _window(t: np.ndarray, where: WhereItFails | None) -> float:
     return float(np.clip(middle - 0.5 * WINDOW, t[0], max(t[0], t[-1] - WINDOW)))
 
 
-def _range(curves: Sequence[np.ndarray], t: np.ndarray, start: float) -> tuple[float, float]:
-    """Lowest and highest of all curves in the first window, with a margin."""
+def _range(curves: Sequence[np.ndarray], t: np.ndarray, start: float, height: float) -> tuple[float, float]:
+    """Lowest and highest of all curves in the first window, on an axis `height` points high."""
     inside = (t >= start) & (t <= start + WINDOW)
     shown = np.concatenate([values[inside] for values in curves])
     shown = shown[np.isfinite(shown)] if np.any(np.isfinite(shown)) else np.zeros(1)
     low, high = np.quantile(shown, [0.001, 0.999])
-    margin = 0.1 * max(high - low, 0.5)
-    return float(low - margin), float(high + margin)
+    return readable(float(low), float(high), height)
 
 
 def _summary(comparisons: Sequence[Comparison]) -> str:

@@ -13,7 +13,7 @@ from trueflight.groundstation.results import Moment
 from trueflight.groundstation.views import scene
 from trueflight.groundstation.views.bars import legend
 from trueflight.groundstation.views.colour import FLOOR, WARNING, Colour
-from trueflight.groundstation.views.recording import TIME, between, curve
+from trueflight.groundstation.views.recording import TIME, between, curve, log_words, readable
 
 MARKED = 3
 """Worst moments that are marked in space."""
@@ -68,10 +68,12 @@ def error_curves(
     name: str,
     worst: Sequence[Moment] = (),
     clock: float | None = None,
+    height: float = 150.0,
 ) -> rrb.TimeSeriesView:
     """Residuals (name, error, colour) over the whole flight beside the noise floor, the worst moments marked.
 
-    `clock` is the time at which every flight begins, where flights are laid over each other.
+    `clock` is the time at which every flight begins, where flights are laid over each other. `height` is that of
+    the view, in points of a window of 900.
     """
     highest, start, end = 0.1, np.inf, -np.inf
     for number, (label, error, colour) in enumerate(errors):
@@ -88,7 +90,7 @@ def error_curves(
         origin=root,
         name=name,
         axis_x=rrb.TimeAxis(view_range=between(start, end)),
-        axis_y=rrb.ScalarAxis(range=(0.0, 1.1 * highest)),
+        axis_y=rrb.ScalarAxis(range=readable(0.0, highest, height)),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=len(errors) > 1),
     )
 
@@ -108,10 +110,8 @@ def _mark(stream: rr.RecordingStream, path: str, worst: Sequence[Moment]) -> Non
 def moments_log(stream: rr.RecordingStream, path: str, worst: Sequence[Moment], name: str) -> rrb.TextLogView:
     """The worst moments as lines of a log at their times: a click on a time moves the whole recording there."""
     for number, moment in enumerate(worst, 1):
-        stream.set_time(TIME, duration=moment.start)
         told = f"worst {number}: {moment.rms:.2f} m/s², until {moment.end:.1f} s: {moment.text}"
-        stream.log(path, rr.TextLog(told, level=rr.TextLogLevel.WARN))
-    stream.reset_time()
+        log_words(stream, path, moment.start, told)
     return rrb.TextLogView(
         origin=path,
         name=name,

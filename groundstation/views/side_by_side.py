@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.output.cited import written
+from trueflight.groundstation.views.bars import bars_over
 from trueflight.groundstation.views.colour import AXES, BETWEEN, LINEAR, NEWEST, REFERENCE, Colour
 from trueflight.groundstation.views.error import error_curves, error_legend, error_path
 from trueflight.groundstation.views.recording import page, recording, text
@@ -29,8 +29,9 @@ def write_side_by_side(path: Path, beside: SideBySide) -> None:
 
 def side_by_side_panel(stream: rr.RecordingStream, beside: SideBySide, root: str = "") -> rrb.Container:
     """The paths in one scale of colours, residuals over time from the start of each flight, and the maps."""
-    first = error_over_time(beside.comparisons[0], SMOOTHING)
-    errors = [first] + [error_over_time(c, SMOOTHING, first.highest) for c in beside.comparisons[1:]]
+    highest = max(error_over_time(c, SMOOTHING).highest for c in beside.comparisons)
+    errors = [error_over_time(c, SMOOTHING, highest) for c in beside.comparisons]
+    first = errors[0]
     spaces = [
         error_path(stream, f"{root}space{k}", error, f"{beside.names[k]}: {error.comparison.rms:.3f} m/s²",
                    distance=1.0)
@@ -42,7 +43,7 @@ def side_by_side_panel(stream: rr.RecordingStream, beside: SideBySide, root: str
     if views:
         rows = [rrb.Horizontal(*views[k : k + 2]) for k in range(0, len(views), 2)]
         left += [*rows, error_legend(stream, f"{root}scale", first, "residual on every path")]
-        shares += [4.0] * len(rows) + [1.0]
+        shares += [4.0] * len(rows) + [1.3]
     one_clock = len({id(c.flight) for c in beside.comparisons}) > 1
     named = [(beside.names[k], e, COLOURS[k % len(COLOURS)]) for k, e in enumerate(errors)]
     start = " from the start of each flight" if one_clock else ""
@@ -74,26 +75,16 @@ def side_by_side_panel(stream: rr.RecordingStream, beside: SideBySide, root: str
     )
 
 
-def _map(stream: rr.RecordingStream, beside: SideBySide, variable: str, root: str) -> rrb.BarChartView:
-    path, unit = f"{root}/{variable.replace(' ', '_')}", ""
-    count = len(beside.where)
+def _map(stream: rr.RecordingStream, beside: SideBySide, variable: str, root: str) -> rrb.Spatial2DView:
+    first = next(m for m in beside.where[0].maps if m.variable == variable)
+    bars = []
     for k, where in enumerate(beside.where):
         m = next((m for m in where.maps if m.variable == variable), None)
-        if m is None:
-            continue
-        unit = "" if m.unit == "1" else f" ({m.unit})"
-        width = np.diff(m.edges)
-        middle = 0.5 * (m.edges[1:] + m.edges[:-1]) + width * 0.92 / count * (k - 0.5 * (count - 1))
-        bars = rr.BarChart(
-            np.nan_to_num(np.asarray(m.rms, dtype=float)),
-            abscissa=middle,
-            widths=0.92 * width / count,
-            color=COLOURS[k % len(COLOURS)],
-        )
-        stream.log(f"{path}/{k}", bars, static=True)
-    return rrb.BarChartView(
-        origin=path, name=f"RMS (m/s²) over {variable}{unit}", plot_legend=rrb.PlotLegend(visible=False)
-    )
+        if m is not None:
+            bars.append((str(k), COLOURS[k % len(COLOURS)], m.rms))
+    unit = "" if first.unit == "1" else f" ({first.unit})"
+    name = f"RMS (m/s²) over {variable}{unit}"
+    return bars_over(stream, name, first.edges, bars, f"{root}/{variable.replace(' ', '_')}")
 
 
 def _table(beside: SideBySide) -> str:

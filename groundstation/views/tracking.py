@@ -13,7 +13,7 @@ from trueflight.groundstation.evaluate.tracking import Tracking, told_apart
 from trueflight.groundstation.views import scene
 from trueflight.groundstation.views.bars import bar_groups
 from trueflight.groundstation.views.colour import EXPECTED, NEWEST, Colour, of_version
-from trueflight.groundstation.views.recording import curve, page, recording, text
+from trueflight.groundstation.views.recording import curve, page, readable, recording, text
 
 
 def write_tracking(path: Path, tracked: Sequence[Tracking]) -> None:
@@ -27,6 +27,7 @@ def tracking_panel(stream: rr.RecordingStream, tracked: Sequence[Tracking], root
     """Flown and expected in space, the distance over time, errors per axis and the table of all."""
     count = len(tracked)
     positions = np.concatenate([t.position for t in tracked])
+    misses = np.concatenate([t.position - t.expected for t in tracked])
     size = scene.extent(positions)
     stream.log(f"{root}space", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for index, t in enumerate(tracked):
@@ -47,19 +48,25 @@ def tracking_panel(stream: rr.RecordingStream, tracked: Sequence[Tracking], root
         eye_controls=scene.eye(positions),
         line_grid=scene.ground(),
     )
-    bars = bar_groups(stream, "mean squared error (cm²) of x, y, z (0, 1, 2)", _groups(tracked), root)
+    bars = bar_groups(
+        stream, "mean squared error, cm²", ("x", "y", "z"), _groups(tracked), f"{root}bars/", wide=150.0
+    )
     distance = rrb.TimeSeriesView(
         origin=f"{root}distance",
         name="distance to the expected position, cm",
+        axis_y=rrb.ScalarAxis(range=readable(0.0, 100 * float(np.linalg.norm(misses, axis=1).max()), 270.0)),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
     )
     errors = [
         rrb.TimeSeriesView(
             origin=f"{root}error/{name}",
             name=f"error in {name}, cm",
+            axis_y=rrb.ScalarAxis(
+                range=readable(100 * float(misses[:, axis].min()), 100 * float(misses[:, axis].max()), 105.0)
+            ),
             plot_legend=rrb.PlotLegend(visible=False),
         )
-        for name in "xyz"
+        for axis, name in enumerate("xyz")
     ]
     text(stream, f"{root}tracked", _summary(tracked))
     return rrb.Horizontal(
@@ -74,7 +81,7 @@ def tracking_panel(stream: rr.RecordingStream, tracked: Sequence[Tracking], root
     )
 
 
-def _groups(tracked: Sequence[Tracking]) -> list[tuple[str, Colour, list[float]]]:
+def _groups(tracked: Sequence[Tracking]) -> list[tuple[str, Colour, list[float | None]]]:
     count = len(tracked)
     colours = [of_version(index, count) if count > 1 else NEWEST for index in range(count)]
     return [

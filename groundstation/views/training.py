@@ -115,11 +115,13 @@ def _scatters(stream: rr.RecordingStream, training: Training, samples: Samples) 
         )
         lines = [[[-half, half], [half, -half]], [[-half, 0], [half, 0]], [[0, -half], [0, half]]]
         stream.log(f"{root}/lines", rr.LineStrips2D(lines, colors=[FLOOR], radii=0.2), static=True)
-        words(stream, f"{root}/words", [(half, 8.0), (-half, 8.0)], [f"{most:.2g}", f"{-most:.2g} m/s²"])
+        along = [(half, 8.0), (-half, 8.0), (7.0, 8.0)]
+        up = [(0.0, -half - 8.0), (0.0, half + 8.0)]
+        words(stream, f"{root}/words", [*along, *up], [f"{x:.2g}" for x in (most, -most, 0.0, most, -most)])
         views.append(
             rrb.Spatial2DView(
                 origin=root,
-                name=f"{name}: learnt over measured",
+                name=f"{name}: learnt over measured, m/s²",
                 visual_bounds=rrb.VisualBounds2D(x_range=[-68, 68], y_range=[-68, 68]),
             )
         )

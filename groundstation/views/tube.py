@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from trueflight.groundstation.evaluate.bound import Tube
 from trueflight.groundstation.views import scene
 from trueflight.groundstation.views.colour import FLOOR, LINEAR, NEWEST, REFERENCE
-from trueflight.groundstation.views.recording import TIME, curve, recording, text, thin
+from trueflight.groundstation.views.recording import TIME, curve, readable, recording, text, thin
 
 BALLS = 60
 """Balls drawn along the middle of the tube at most; more hide the path."""
@@ -52,7 +52,7 @@ def _blueprint(stream: rr.RecordingStream, tube: Tube) -> rrb.Blueprint:
         _mark(stream, f"level/{axis}/left", tube, axis, clock, tube.level[:, k])
         d = _broken(np.abs(tube.disturbance.total[:, k]), breaks)
         curve(stream, f"level/{axis}/d", clock, d, "|d|", FLOOR, 1.0)
-        rows.append(_row(axis, first=k == 0))
+        rows.append(_row(tube, k, first=k == 0))
     _log_space(stream, tube, clock)
     text(stream, "summary", _summary(tube))
     space = rrb.Spatial3DView(
@@ -72,15 +72,29 @@ def _blueprint(stream: rr.RecordingStream, tube: Tube) -> rrb.Blueprint:
     )
 
 
-def _row(axis: str, first: bool) -> rrb.Horizontal:
-    legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=first)
+def _row(tube: Tube, k: int, first: bool) -> rrb.Horizontal:
+    axis, legend = "xyz"[k], rrb.PlotLegend(rrb.Corner2D.RightTop, visible=first)
+    ends = []
+    for c in (0, 1):
+        centre, extent = tube.centre[:, k, c], tube.extent[:, k, c]
+        ends.append(100.0 * np.concatenate([centre - extent, centre + extent, tube.eta[:, k, c]]))
+    level = np.concatenate(
+        [[0.0], tube.predicted[:, k], tube.level[:, k], np.abs(tube.disturbance.total[:, k])]
+    )
     return rrb.Horizontal(
         *(
-            rrb.TimeSeriesView(origin=f"{origin}/{axis}", name=name, plot_legend=legend)
-            for origin, name in (
-                ("position", f"position error in {axis}, cm"),
-                ("velocity", f"velocity error in {axis}, cm/s"),
-                ("level", f"V^½ of {axis}, and |d|, m/s²"),
+            rrb.TimeSeriesView(
+                origin=f"{origin}/{axis}",
+                name=name,
+                axis_y=rrb.ScalarAxis(
+                    range=readable(float(np.nanmin(drawn)), float(np.nanmax(drawn)), 215.0)
+                ),
+                plot_legend=legend,
+            )
+            for origin, name, drawn in (
+                ("position", f"position error in {axis}, cm", ends[0]),
+                ("velocity", f"velocity error in {axis}, cm/s", ends[1]),
+                ("level", f"V^½ of {axis}, and |d|, m/s²", level),
             )
         )
     )

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 from trueflight.groundstation.evaluate.error_over_time import error_over_time
 from trueflight.groundstation.results import Comparison, WaterfallStep
 from trueflight.groundstation.views.bars import bar_groups
-from trueflight.groundstation.views.colour import FLOOR, NEWEST, Colour, of_version
+from trueflight.groundstation.views.colour import NEWEST, Colour, of_version
 from trueflight.groundstation.views.error import error_curves, error_legend, error_path
 from trueflight.groundstation.views.recording import page, recording, text
 
@@ -40,8 +40,9 @@ def waterfall_panel(
 ) -> rrb.Container:
     """Bars of the residual over the model versions beside the path of the first and of the last, in one scale."""
     held_out = all(step.held_out is not None for step in steps)
-    first = error_over_time(before, SMOOTHING)
-    errors = [("before", first), ("after", error_over_time(after, SMOOTHING, first.highest))]
+    highest = max(error_over_time(c, SMOOTHING).highest for c in (before, after))
+    first = error_over_time(before, SMOOTHING, highest)
+    errors = [("before", first), ("after", error_over_time(after, SMOOTHING, highest))]
     text(stream, f"{root}steps", _summary(before, after, steps, held_out))
     which = "held-out flight" if held_out else "fitted flight"
     right = rrb.Vertical(
@@ -66,22 +67,28 @@ def waterfall_panel(
     if not shown:
         return rrb.Vertical(right, name="before and after")
     scale = error_legend(stream, f"{root}scale", first, "residual on both paths")
-    left = rrb.Vertical(*shown, scale, row_shares=[*[4] * len(shown), 1])
+    left = rrb.Vertical(*shown, scale, row_shares=[*[4] * len(shown), 1.2])
     return rrb.Horizontal(left, right, column_shares=[1, 1], name="before and after")
 
 
 def waterfall_bars(
     stream: rr.RecordingStream, steps: Sequence[WaterfallStep], root: str = ""
-) -> rrb.BarChartView:
+) -> rrb.Spatial2DView:
     """One group of bars a model version: fitted, held out, noise floor."""
-    groups: list[tuple[str, Colour, list[float]]] = [
+    groups: list[tuple[str, Colour, list[float | None]]] = [
         ("fitted flight", NEWEST, [step.fitted for step in steps])
     ]
     if all(step.held_out is not None for step in steps):
-        groups.append(("held-out flight", HELD_OUT, [step.held_out or 0.0 for step in steps]))
-    groups.append(("noise floor", FLOOR, [step.noise_floor for step in steps]))
-    told = ", ".join(f"{k} {step.label}" for k, step in enumerate(steps))
-    return bar_groups(stream, f"residual RMS (m/s²): {told}", groups, root)
+        groups.append(("held-out flight", HELD_OUT, [step.held_out for step in steps]))
+    labels = [step.label for step in steps]
+    return bar_groups(
+        stream,
+        "residual RMS of each model, m/s²",
+        labels,
+        groups,
+        f"{root}bars/",
+        ("noise floor", steps[-1].noise_floor),
+    )
 
 
 def _summary(before: Comparison, after: Comparison, steps: Sequence[WaterfallStep], held_out: bool) -> str:

@@ -11,6 +11,7 @@ import rerun.blueprint as rrb
 from trueflight.groundstation.evaluate.error_over_time import ErrorOverTime, error_over_time
 from trueflight.groundstation.results import Comparison, ErrorMap, PlaceMap, WhereItFails
 from trueflight.groundstation.views import scene
+from trueflight.groundstation.views.bars import bars_over
 from trueflight.groundstation.views.colour import FLOOR, NEWEST, REFERENCE, of_error
 from trueflight.groundstation.views.error import (
     error_curves,
@@ -48,7 +49,7 @@ def where_panel(
     space = error_path(stream, f"{root}space", error, name, where.worst, vehicle=True)
     if space is not None:
         views += [space, error_legend(stream, f"{root}legend", error, f"residual of {comparison.label}")]
-        shares += [7.0, 1.2]
+        shares += [7.0, 1.6]
     views.append(
         error_curves(
             stream,
@@ -91,27 +92,12 @@ def where_panel(
 
 def _map(
     stream: rr.RecordingStream, error_map: ErrorMap, left: WhereItFails | None, root: str
-) -> rrb.BarChartView:
-    path = f"{root}/{error_map.variable.replace(' ', '_')}"
-    middle = 0.5 * (error_map.edges[1:] + error_map.edges[:-1])
-    width = np.diff(error_map.edges)
+) -> rrb.Spatial2DView:
     rest = None if left is None else next((m for m in left.maps if m.variable == error_map.variable), None)
-    bars = [("before", error_map.rms, NEWEST)] + ([] if rest is None else [("left", rest.rms, REFERENCE)])
-    for number, (name, rms, colour) in enumerate(bars):
-        share = 0.92 / len(bars)
-        places = middle + width * share * (number - 0.5 * (len(bars) - 1))
-        values = np.nan_to_num(np.asarray(rms, dtype=float))
-        stream.log(
-            f"{path}/{name}",
-            rr.BarChart(values, abscissa=places, widths=share * width, color=colour),
-            static=True,
-        )
+    bars = [("before", NEWEST, error_map.rms)] + ([] if rest is None else [("left", REFERENCE, rest.rms)])
     unit = "" if error_map.unit == "1" else f" ({error_map.unit})"
-    return rrb.BarChartView(
-        origin=path,
-        name=f"RMS (m/s²) over {error_map.variable}{unit}",
-        plot_legend=rrb.PlotLegend(visible=False),
-    )
+    name = f"RMS (m/s²) over {error_map.variable}{unit}"
+    return bars_over(stream, name, error_map.edges, bars, f"{root}/{error_map.variable.replace(' ', '_')}")
 
 
 def _place(stream: rr.RecordingStream, place: PlaceMap, error: ErrorOverTime, root: str) -> rrb.Spatial3DView:
@@ -135,7 +121,7 @@ def _place(stream: rr.RecordingStream, place: PlaceMap, error: ErrorOverTime, ro
     stream.log(f"{root}/path", rr.LineStrips3D([line], colors=[FLOOR], radii=0.002 * size), static=True)
     return rrb.Spatial3DView(
         origin=root,
-        name=f"over the ground, cells of {place.cell:g} m, north up",
+        name=f"north up, cells {place.cell:g} m",
         eye_controls=rrb.EyeControls3D(
             position=middle + [0.0, -0.01 * size, 1.25 * size], look_target=middle, eye_up=[0.0, 1.0, 0.0]
         ),
