@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from trueflight.groundstation.commands.linked import linked
@@ -24,6 +23,7 @@ from trueflight.groundstation.commands.options import (
 )
 from trueflight.groundstation.output.terminal import print_warning
 from trueflight.models.errors import InputError
+from trueflight.models.terminal import Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.live.sources import Source
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from trueflight.models.model import Model
     from trueflight.models.vehicle import Vehicle
 
-console = Console()
+console = Terminal()
 
 
 def register(app: typer.Typer) -> None:
