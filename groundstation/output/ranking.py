@@ -70,9 +70,16 @@ def next_command(d: Diagnosis, validate: Path | None = None) -> str:
 
 def _headline(d: Diagnosis) -> str:
     name = d.flight.name if not d.flights else f"{len(d.flights)} flights of {d.flight.vehicle.name}"
-    missing, possible = d.named("missing"), d.named("possible")
+    ended = {
+        e.name: e.over_time for e in d.effects if e.verdict == "missing" and e.over_time and e.over_time.ended
+    }
+    missing = [n for n in d.named("missing") if n not in ended]
+    was = [f"{n} was until {course.changes[-1].time:.1f} s" for n, course in ended.items()]
+    possible = d.named("possible")
     if missing:
-        return f"{name}: {' and '.join(missing)} missing"
+        return f"{name}: {', '.join([' and '.join(missing) + ' missing', *was])}"
+    if was:
+        return f"{name}: nothing is missing at its end; {', '.join(was)}"
     if possible:
         return f"{name}: nothing is surely missing, {' or '.join(possible)} may be"
     return f"{name}: nothing is missing that this flight could show"

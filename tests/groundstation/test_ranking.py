@@ -75,6 +75,9 @@ def test_what_ended_in_flight_is_not_added(diagnosis: Diagnosis) -> None:
     ended = replace(diagnosis, effects=(replace(found, over_time=gone),))
     assert diagnosis.to_add == ("rotor_drag",) and ended.to_add == ()
     assert next_command(ended) == ""
+    assert told(ended, 80).startswith(
+        "identify: nothing is missing at its end; rotor_drag was until 41.2 s\n"
+    )
 
 
 def test_effects_that_are_missing_together_are_added_together(tmp_path: Path) -> None:

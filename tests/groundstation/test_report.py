@@ -193,6 +193,11 @@ def test_the_verdict_says_in_words_what_was_found(table):
     assert headline == "rotor_drag is missing from the model."
     assert "linear drag in the rotor plane" in effect and "54 %" in effect
     assert "0.315 to 0.213" in fall and "0.300 to 0.212" in held_out
+    course = {"ended": True, "changes": [{"time": 41.2}], "text": ["x = 0.2 until 41.2 s, none after"]}
+    gone = [{**e, "over_time": course} if e["verdict"] == "missing" else e for e in table["effects"]]
+    headline, ended, *_ = sentences({**table, "effects": gone}, html=False)
+    assert headline.startswith("Nothing is missing from the model at the end of this flight; rotor_drag was")
+    assert ended == "rotor_drag ended at 41.2 s: x = 0.2 until 41.2 s, none after."
     nothing = {**table, "effects": [e for e in table["effects"] if e["verdict"] == "included"]}
     assert (
         sentences(nothing, html=False)[0] == "Nothing is missing from the model that this flight could show."
