@@ -263,7 +263,7 @@ def test_the_recording_tells_the_same(tmp_path, analysis, table):
         assert number in told.stdout, number
     for entity in (
         "/verdict/moments", "/predicted/acceleration/z/measured", "/where/space/path", "/where/maps/tilt/before",
-        "/where/place/cells", "/steps/fitted_flight", "/beside/maps/height/1",
+        "/where/place/cells", "/steps/bars/fitted_flight", "/beside/maps/height/1",
     ):  # fmt: skip
         assert entity in told.stdout, entity
     assert path.stat().st_size < 5_000_000
