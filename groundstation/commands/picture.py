@@ -50,11 +50,12 @@ def _drawing(command: Callable[..., Any], recording: str) -> Callable[..., Any]:
             return command(**given)
         given[recording] = given[recording] or png.with_suffix(".rrd")
         done = command(**given)
+        from trueflight.groundstation.operate.processes import program
         from trueflight.groundstation.views.picture import draw
 
         errors = Terminal(stderr=True)  # what is asked for with --json stays one document
         with working(errors, "drawing", not errors.is_terminal):
-            draw(given[recording], png)
+            draw(given[recording], png, program("rerun"))
         errors.print(f"picture: {png}", markup=False, highlight=False)
         return done
 

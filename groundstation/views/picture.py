@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from trueflight.groundstation.operate.processes import program
 from trueflight.models.errors import InputError
 from trueflight.models.whole_file import whole_file
 
@@ -25,14 +24,14 @@ STARTED_WITHIN, STILL_WITHIN = 60.0, 60.0  # s
 PACE = 0.5  # s between two looks
 
 
-def draw(recording: Path, picture: Path, size: tuple[int, int] = SIZE) -> None:
-    """Draw what `recording` opens on as the PNG file `picture`.
+def draw(recording: Path, picture: Path, rerun: str, size: tuple[int, int] = SIZE) -> None:
+    """Draw what `recording` opens on as the PNG file `picture`; `rerun` is the viewer's program.
 
     Raises `InputError` where this machine cannot draw, or the picture cannot be written.
     """
     with (
         whole_file(picture, "the picture", "choose another --png") as partial,
-        _viewer(recording, size) as viewer,
+        _viewer(recording, rerun, size) as viewer,
     ):
         viewer.open(str(recording.resolve()))
         viewer.set_time(play_state="paused")
@@ -47,7 +46,7 @@ def draw(recording: Path, picture: Path, size: tuple[int, int] = SIZE) -> None:
 
 
 @contextmanager
-def _viewer(recording: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
+def _viewer(recording: Path, rerun: str, size: tuple[int, int]) -> Iterator[ViewerClient]:
     """A viewer without a window, on a port of its own."""
     from rerun.experimental import ViewerClient
 
@@ -63,7 +62,7 @@ def _viewer(recording: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
         f"{size[0]}x{size[1]}",
     ]
     process = subprocess.Popen(
-        [program("rerun"), *words],
+        [rerun, *words],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

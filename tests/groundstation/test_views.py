@@ -177,7 +177,7 @@ def test_where_it_fails_is_drawn_in_the_colours_of_the_error(recordings, tmp_pat
     has."""
     picture = tmp_path / "where.png"
     try:
-        draw(recordings / "where.rrd", picture, (480, 270))
+        draw(recordings / "where.rrd", picture, str(RERUN), (480, 270))
     except InputError as error:
         pytest.skip(str(error))
     scale = of_error(np.linspace(0.0, 1.0, 64), 1.0).astype(int)
@@ -190,7 +190,7 @@ def test_a_machine_that_cannot_draw_says_so_and_keeps_the_recording(recordings, 
     for name in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES", "LIBGL_DRIVERS_PATH", "__EGL_VENDOR_LIBRARY_DIRS"):
         monkeypatch.setenv(name, str(tmp_path / "none"))
     with pytest.raises(InputError, match=r"where.rrd is written, but this machine cannot draw"):
-        draw(recordings / "where.rrd", tmp_path / "where.png")
+        draw(recordings / "where.rrd", tmp_path / "where.png", str(RERUN))
     assert list(tmp_path.iterdir()) == []
 
 
