@@ -10,7 +10,6 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from trueflight.groundstation.commands.choosing import offer_sources
-from trueflight.groundstation.commands.picture import offer_pictures
 
 
 class Entry(NamedTuple):
@@ -163,6 +162,8 @@ class Loading(Mapping[str, TyperCommand | TyperGroup]):
 
     def __getitem__(self, name: str) -> TyperCommand | TyperGroup:
         if name not in self._made:
+            from trueflight.groundstation.commands.picture import offer_pictures
+
             part = typer.Typer(rich_markup_mode=MARKUP)
             module = import_module(f"trueflight.groundstation.commands.{self._entries[name].module}")
             module.register(part)
