@@ -18,11 +18,13 @@ from widths import whole_at_every_width
 from trueflight.companion import cli, onboard_commands
 from trueflight.companion.findings import DANGER, FAIL, NOTE, OK, Finding
 from trueflight.companion.preflight import Parameter, Preflight
-from trueflight.groundstation.commands import collect, demo, reproduce, status
+from trueflight.groundstation.commands import collect, compare_controllers, demo, reproduce, status
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.writing import write_flight
+from trueflight.groundstation.study.controllers import DISTURBANCES, Cell
 from trueflight.groundstation.study.reproduce import ARMS, SCENARIOS, Flown, Prepared, Study
+from trueflight.models.contract import CONTROLLERS
 from trueflight.models.model import rigid_body_model
 from trueflight.models.terminal import Terminal
 from trueflight.models.vehicle import load_vehicle
@@ -204,6 +206,14 @@ def test_the_paper_and_the_demonstration(flown: Path) -> None:
         prepared = Prepared(1, {}, ("rotor_drag", "ground_effect"), dict.fromkeys(names, 0.05))
         reproduce._print(Study(made, (prepared,)), SCENARIOS, False)
     flight = read_flight(ROOT / "samples" / "rotorpy" / "rotor_drag" / "identify.parquet")
+    cells = [
+        Cell(seed, one.name, name, 0.01 * seed, 0.02, "finished")
+        for seed in (1, 2)
+        for one in DISTURBANCES
+        for name in CONTROLLERS
+    ]
+    with figures("groundstation compare-controllers") as terminal:
+        terminal.print(compare_controllers._table(cells, DISTURBANCES, CONTROLLERS, "reference"))
     with figures("groundstation demo"):
         demo._print_real([("carries a payload", diagnose(flight, rigid_body_model(flight.vehicle)))])
 

@@ -10,18 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from trueflight.groundstation.commands.options import JobsOption, JsonOption
 from trueflight.groundstation.output.terminal import counted
 from trueflight.models.printed import print_json
 from trueflight.models.shipped import QUAD5
+from trueflight.models.terminal import Table, Terminal
 
 if TYPE_CHECKING:
     from trueflight.groundstation.study.controllers import Cell, Disturbance
 
-console = Console()
+console = Terminal()
 MEASURES = {"reference": "to the reference", "linear": "to the linear behaviour"}
 
 
