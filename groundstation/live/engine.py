@@ -102,15 +102,19 @@ def _look(snapshot: Snapshot) -> Said:
 
 
 def _widths(effects: Sequence[EffectVerdict], base: Model) -> tuple[tuple[str, float], ...]:
-    """Half-widths of intervals in typical sizes, by "effect/parameter", of what is found."""
+    """Half-widths of intervals, in parts of what is typical beyond "no effect", by "effect/parameter", of what is
+    found."""
     from trueflight.models.effects import catalogue
 
-    known = catalogue(base.effects_directory)
-    return tuple(
-        (f"{e.name}/{p.name}", 0.5 * (p.high - p.low) / abs(one.typical))
-        for e in effects
-        if e.rank is not None and e.name in known
-        for one in known[e.name].parameters
-        for p in e.parameters
-        if p.name == one.name and one.typical
-    )
+    known, found = catalogue(base.effects_directory), []
+    for e in effects:
+        if e.rank is None or e.name not in known:
+            continue
+        neutral = known[e.name].neutral(base.vehicle)
+        for p in known[e.name].parameters:
+            size = abs(p.typical - neutral.get(p.name, 0.0))
+            widths = [
+                0.5 * (told.high - told.low) / size for told in e.parameters if told.name == p.name and size
+            ]
+            found += [(f"{e.name}/{p.name}", width) for width in widths]
+    return tuple(found)

@@ -21,8 +21,8 @@ class Said:
     """What one look says of the flight number `flight` of the vehicle `name`.
 
     The window reaches from `start` to `stop`, s on the flight's clock; the look took `cost` s of processor time and was
-    `thorough` or not. RMS in m/s². `widths` are the half-widths of the intervals of what is found, in typical sizes, by
-    "effect/parameter". Where there could be none, `error` says why.
+    `thorough` or not. RMS in m/s². `widths` are the half-widths of the intervals of what is found, in parts of what is
+    typical, by "effect/parameter". Where there could be none, `error` says why.
     """
 
     name: str

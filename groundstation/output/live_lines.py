@@ -17,9 +17,8 @@ from trueflight.models.printed import print_json_line
 from trueflight.models.record_pb2 import Event, Tick
 
 LEFT_OUT = (
-    "not asked while it flies: what drifts by and by, gusts and other structure of what is left, a held-out flight; "
-    "new effects, and other sets that explain as much, are looked for by every fifth look: groundstation diagnose asks "
-    "all"
+    "not asked while it flies: what drifts by and by, gusts and other structure of what is left, a held-out flight "
+    "(groundstation diagnose asks all); new effects, and other sets that explain as much, by every fifth look"
 )
 
 

@@ -103,7 +103,9 @@ class Views:
 
     def state(self, name: str, silent: float, status: dict[str, Any]) -> None:
         """As in `live.watch.Shown`."""
-        self._of[name][0].tell(silent, status)
+        monitor, panes = self._of[name]
+        monitor.tell(silent, status)
+        panes.grow_old(monitor.now)
 
     def said(self, name: str, said: Said, alerts: Sequence[Alert], news: Sequence[Alert], age: float) -> None:
         """As in `live.watch.Shown`."""
@@ -258,7 +260,7 @@ def blueprint(diagnosed: bool = True) -> rrb.Blueprint:
     if diagnosed:
         left.append(panes("", "diagnosis while it flies"))
     left.append(_events())
-    shares = [4, 3, 1] if diagnosed else [4, 1]
+    shares = [3.4, 3.4, 1.2] if diagnosed else [4, 1]
     return _page(
         rrb.Horizontal(
             rrb.Vertical(*left, row_shares=shares), rrb.Vertical(*_curves("")), column_shares=[5, 4]
