@@ -67,7 +67,7 @@ class Alert:
         others = f" (or {', '.join(self.or_else)})" if self.or_else else ""
         if self.taken_back:
             return f"taken back: {self.effect} at {self.time:.1f} s is not seen any more"
-        return f"{self.effect}{others} changed at {self.time:.1f} s [{self.low:.1f}, {self.high:.1f}]: {self.words}"
+        return f"{self.effect}{others} changed at {self.time:.1f} s: {self.words}"
 
 
 def follow(alerts: tuple[Alert, ...], said: Said) -> tuple[tuple[Alert, ...], tuple[Alert, ...]]:

@@ -98,12 +98,14 @@ class Lines:
             f"{name}, {said.stop:.0f} s: {'; '.join(told) or 'nothing is missing'} "
             f"(residual {said.rms_before:.2g} → {said.rms_after:.2g} m/s²)",
             highlight=False,
+            soft_wrap=True,
         )
         for line in not_excited(said, most=1):
-            self._console.print(f"  not excited yet: {escape(line)}", style="cyan", highlight=False)
+            told_of = f"  not excited yet: {escape(line)}"
+            self._console.print(told_of, style="cyan", highlight=False, soft_wrap=True)
 
     def _print(self, name: str, text: str, style: str) -> None:
-        self._console.print(f"{name}: {escape(text)}", style=style, highlight=False)
+        self._console.print(f"{name}: {escape(text)}", style=style, highlight=False, soft_wrap=True)
 
 
 def numbers(effect: Any) -> str:

@@ -101,12 +101,12 @@ def panes(root: str, name: str) -> rrb.Container:
         rrb.Vertical(
             rrb.TimeSeriesView(
                 origin=f"{root}diagnosis/residual",
-                name="residual (m/s²): before orange, after blue",
+                name="residual (m/s²)",
                 plot_legend=rrb.PlotLegend(visible=False),
             ),
             rrb.TimeSeriesView(
                 origin=f"{root}diagnosis/narrowing",
-                name="half of each 95 % interval, as part of a typical size",
+                name="95 % intervals narrow",
             ),
         ),
         column_shares=[3, 2],

@@ -276,7 +276,7 @@ def blueprint_of(vehicles: Sequence[str], diagnosed: bool = True) -> rrb.Bluepri
         if diagnosed:
             parts.append(panes(f"{name}/", f"{name}, diagnosis"))
         curves = rrb.Tabs(*_curves(f"{name}/"), name=f"{name}, curves")
-        shares = [2, 4, 2.5] if diagnosed else [2, 2.5]
+        shares = [3, 4, 2.5] if diagnosed else [3, 2.5]
         each.append(rrb.Vertical(*parts, curves, row_shares=shares))
     space = _space("vehicles, paths (blue), references (green)")
     left = rrb.Vertical(space, _events(), row_shares=[4, 1])

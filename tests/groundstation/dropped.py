@@ -12,18 +12,18 @@ from trueflight.sim_bridge.plan import Plan
 from trueflight.sim_bridge.truth.hidden import Hidden
 
 QUAD5 = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
-DROPPED = 15.0
+DROPPED = 12.0
 """s after take-off."""
 
 
-def dropped_payload(path: Path) -> Path:
-    """A record of half a minute that carries 12 % more than is believed, until that is dropped."""
+def dropped_payload(path: Path, rate: float = 50.0) -> Path:
+    """A record of 20 s that carries 12 % more than is believed, until that is dropped."""
     believed = load_vehicle(QUAD5)
     design = load_design(QUAD5.with_name("design.json"), believed)
     loads = tuple(
         Hidden("payload", {"mass_fraction": share, "time": t}) for share, t in ((0.12, 0.0), (0.0, DROPPED))
     )
-    flown = trajectory("circle", laps=6.0)
-    plan = Plan(believed, design, flown, loads, seed=5, rate=50.0, rotor_speeds=False)
+    flown = trajectory("circle", laps=4.0)
+    plan = Plan(believed, design, flown, loads, seed=5, rate=rate, rotor_speeds=False)
     assert record(plan, path).outcome == "finished"
     return path

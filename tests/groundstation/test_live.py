@@ -93,7 +93,7 @@ def test_a_change_is_told_once_and_only_after_it_persists():
     _, told = told_of([a_look(50.0 + k, 41.0) for k in range(20)])
     ((when, alert),) = told
     assert when == 50.0 + PERSISTS - 1 and alert.first == 50.0
-    assert "thrust_gain changed at 41.0 s" in alert.text
+    assert "thrust_gain changed at 41.0 s:" in alert.text
 
 
 def test_what_one_look_sees_and_the_next_does_not_is_never_told():

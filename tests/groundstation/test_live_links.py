@@ -35,7 +35,7 @@ PATIENCE = 90.0
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    return dropped_payload(tmp_path_factory.mktemp("flown") / "dropped.mcap")
+    return dropped_payload(tmp_path_factory.mktemp("flown") / "dropped.mcap", rate=100.0)
 
 
 ROUTER = """
@@ -131,7 +131,7 @@ def test_a_hole_that_a_dead_router_left_is_filled_from_the_companions_record(flo
         telemetry.close()
         first.kill()
     start, stop = filled[0]["vehicle_time"]
-    assert stop - start > 0.5 and filled[0]["ticks"] == pytest.approx(50 * (stop - start), abs=2)
+    assert stop - start > 0.5 and filled[0]["ticks"] == pytest.approx(100 * (stop - start), abs=2)
 
 
 def test_two_vehicles_are_watched_at_once(flown, tmp_path):
