@@ -32,7 +32,7 @@ def open_command(
     flights: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="[FLIGHT]...",
+            metavar="FLIGHT...",
             help="Flights, or folders of flights; more can be dropped.",
             show_default=False,
         ),
