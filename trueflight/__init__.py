@@ -52,6 +52,7 @@ __all__ = [  # noqa: F405 (loaded by __getattr__)
     "reveal",
     "side_by_side",
     "simulate",
+    "simulate_many",
     "track",
     "train",
     "where",

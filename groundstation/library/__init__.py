@@ -22,6 +22,7 @@ from trueflight.groundstation.library.making import (
     export,
     reveal,
     simulate,
+    simulate_many,
     train,
 )
 from trueflight.groundstation.library.models import Model
@@ -68,6 +69,7 @@ __all__ = [
     "reveal",
     "side_by_side",
     "simulate",
+    "simulate_many",
     "track",
     "train",
     "where",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import csv
+import io
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -223,6 +226,55 @@ def simulate(
             words += [option, given]
     run_json(words)
     return read(output)
+
+
+def simulate_many(
+    folder: str | Path,
+    flights: Sequence[Mapping[str, object]],
+    *,
+    vehicle: str | Path = QUAD5,
+    jobs: int = 0,
+) -> Iterator[Flight]:
+    """Fly many flights in the simulator at once, each into `folder`/NAME.mcap; reads them one by one, in order.
+
+    Each of `flights` names the options of its flight, as columns of `sim-bridge fly-many --flights` do: `trajectory`,
+    `hidden`, `seed`, `noise`, `controller`, `name` and so on, several texts as a sequence ("excitation" where there is
+    no `trajectory`). `vehicle` is the vehicle.toml of those that name none; `jobs` processes fly, one for each core
+    with 0. All are flown before the first is read.
+
+    It runs `sim-bridge`, the program. Raises `InputError` for whatever that refuses.
+    """
+    from trueflight.groundstation.operate.processes import run_json
+
+    columns = list(dict.fromkeys(name for one in flights for name in one))
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    for one in flights:
+        writer.writerow([_cell(name, one.get(name, "")) for name in columns])
+    with tempfile.TemporaryDirectory() as place:
+        table = Path(place) / "flights.csv"
+        table.write_text(out.getvalue(), encoding="utf-8")
+        words: list[object] = [
+            "sim-bridge",
+            "fly-many",
+            "--flights",
+            table,
+            "--vehicle",
+            Path(vehicle).resolve(),
+        ]
+        words += ["--trajectory", "excitation", "-o", folder, "--jobs", jobs, "--json"]
+        told = run_json(words)["flights"]
+    return (read(one["record"]) for one in told)
+
+
+def _cell(name: str, value: object) -> str:
+    """As a table has it; a file's name is relative to where this program runs, not to the table."""
+    if value and (name in ("vehicle", "design", "model") or str(value).endswith(".csv")):
+        return str(Path(str(value)).resolve())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return ";".join(map(str, value))
+    return str(value)
 
 
 def reveal(flight: columns.Flight) -> dict[str, dict[str, float]]:

@@ -18,7 +18,7 @@ from trueflight.sim_bridge.plan import Plan, legs_of
 
 AT_ONCE = 256
 """Flights of one batch at most: they have half a megabyte each, and more of them at once are hardly faster."""
-WORTH_IT = 8
+WORTH_IT = 24
 """Flights from which on arrays are faster than one flight after the other."""
 
 

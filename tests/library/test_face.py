@@ -213,6 +213,20 @@ def test_a_flight_is_simulated_tracked_and_revealed(tmp_path: Path) -> None:
         tf.simulate(tmp_path / "b.mcap", hidden="rotor_drg")
 
 
+def test_many_flights_are_simulated_and_read_one_by_one(tmp_path: Path) -> None:
+    hover: dict[str, object] = {
+        "trajectory": "hover",
+        "set": ["duration=3"],
+        "hidden": ["rotor_drag:0.3", "wind:2"],
+    }
+    flights = tf.simulate_many(tmp_path, [{**hover, "name": f"no-{i}", "seed": i} for i in range(3)], jobs=1)
+    first, *others = list(flights)
+    assert [Path(one.origin).stem for one in (first, *others)] == ["no-0", "no-1", "no-2"]
+    assert first.position is not None and len(others[1]) == len(first) > 100
+    with pytest.raises(tf.InputError, match=r"sim-bridge fly-many failed: .*column 'sed' is no option"):
+        tf.simulate_many(tmp_path, [{"sed": 1}])
+
+
 def test_gains_are_designed() -> None:
     from trueflight.models.shipped import QUAD5
 
