@@ -135,7 +135,8 @@ class Course:
         `left` (K, A) remains."""
         seen = np.sum(change * left, axis=1)
         energy = float(np.mean(np.sum(change**2, axis=1)))
-        return variance_per_independent_sample(self.problem, seen[:, None]) / max(energy, 1e-30)
+        # an effect that does nothing here has no unit: any will do but none
+        return max(variance_per_independent_sample(self.problem, seen[:, None]), 1e-30) / max(energy, 1e-30)
 
     def fitted(self, moments: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """What changes at exactly these moments add (K, A), by least squares, and what remains (K, A)."""
