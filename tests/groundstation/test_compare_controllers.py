@@ -1,6 +1,7 @@
 """Controllers beside each other: flown by the real program, in both measures, kept, and refused by name."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import programs
@@ -9,6 +10,10 @@ from json_schemas import valid
 
 from trueflight.groundstation.study.controllers import DISTURBANCES, Cell, chosen_controllers
 from trueflight.models.contract import CONTROLLERS
+from trueflight.models.shipped import QUAD5
+from trueflight.models.vehicle import load_vehicle
+from trueflight.sim_bridge.plan import trajectory_of
+from trueflight.sim_bridge.truth.hidden import choose
 
 
 def asked(output: Path, *more: str) -> tuple[str, ...]:
@@ -45,6 +50,15 @@ def test_unknown_names_are_refused_in_one_line_and_nothing_is_made(words, told: 
     done = programs.run("groundstation", *asked(tmp_path / "study", *words), cwd=tmp_path)
     assert done.returncode == 2 and told in done.stderr
     assert not (tmp_path / "study").exists()
+
+
+def test_simulator_knows_every_disturbance() -> None:
+    vehicle = load_vehicle(QUAD5)
+    for one in DISTURBANCES:
+        hidden = [word for before, word in pairwise(one.truth) if before == "--hidden"]
+        assert len(choose(hidden or ["none"], vehicle, 1)) == len(hidden), one.name
+        assignments = [word for before, word in pairwise(one.trajectory) if before == "--set"]
+        assert trajectory_of(one.trajectory[0], assignments).duration > 10.0
 
 
 def test_every_controller_is_flown_unless_some_are_named() -> None:
