@@ -194,8 +194,8 @@ def flown(kind: str, mavlink: int, rate: float, seconds: float, folder: Path, mo
     return [subject, spawn(__file__, "--listen", zenoh_port, seconds + 30.0, controller)]
 
 
-def measure(kind: str, rate: float, seconds: float, models: Path) -> dict[str, Any]:
-    """One program against the autopilot at one rate."""
+def measure(kind: str, rate: float, seconds: float, models: Path, load: int) -> dict[str, Any]:
+    """One program against the autopilot at one rate, once it is ready beside `load` busy ones."""
     mavlink, flying = free_port(), kind not in ECHOES
     pilot = spawn(__file__, "--autopilot", mavlink, free_port(), int(flying), seconds)
     line(pilot, "ready")
@@ -206,6 +206,7 @@ def measure(kind: str, rate: float, seconds: float, models: Path) -> dict[str, A
             from trueflight.models.vehicle import load_vehicle
 
             others = [spawn(__file__, "--echo", mavlink, rate, kind, load_vehicle(VEHICLE).hover_thrust)]
+        others += busy(load)
         try:
             line(pilot, "measuring")
             begin, spent = time.monotonic(), processor_time(others[0])
@@ -265,15 +266,9 @@ def busy(count: int) -> list[subprocess.Popen[str]]:
 
 def compared(rate: float, load: int, programs: list[str], a: argparse.Namespace) -> list[dict[str, Any]]:
     """One row a program at one rate and load, as ratios to the first."""
-    others = busy(load)
-    try:
-        rounds = [
-            {kind: measure(kind, rate, a.seconds, a.models) for kind in programs} for _ in range(a.rounds)
-        ]
-    finally:
-        for process in others:
-            process.kill()
-            process.wait()
+    rounds = [
+        {kind: measure(kind, rate, a.seconds, a.models, load) for kind in programs} for _ in range(a.rounds)
+    ]
     rows: list[dict[str, Any]] = []
     for kind in programs:
         own = [one[kind] for one in rounds]
