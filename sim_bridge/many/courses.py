@@ -92,6 +92,10 @@ class Courses:
         self._last: dict[str, np.ndarray] = {}
         self._blocks: dict[str, tuple[int, np.ndarray, np.ndarray]] = {}
 
+    def leg_at(self, flight: int, tick: int) -> tuple[Trajectory, float]:
+        """The leg of a tick of one flight, and the time in it (s)."""
+        return self._courses[flight].leg_at(tick)
+
     def at(self, tick: int) -> References:
         """The references of this tick."""
         return References.of(self.rows("now", tick, np.zeros(len(self._courses))))

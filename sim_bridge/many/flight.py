@@ -15,6 +15,7 @@ from trueflight.sim_bridge.in_process import FALLEN, LOST, Flown
 from trueflight.sim_bridge.many.cascade import States, Steps
 from trueflight.sim_bridge.many.controllers import Crew, ManyLqr, ManyLqrIntegral
 from trueflight.sim_bridge.many.courses import Courses, References
+from trueflight.sim_bridge.many.one_by_one import OneByOne
 from trueflight.sim_bridge.many.sensing import Estimates
 from trueflight.sim_bridge.many.vehicles import Vehicles
 from trueflight.sim_bridge.plan import Plan
@@ -191,7 +192,7 @@ def _crew(name: str, plans: Sequence[Plan], laws: Sequence[ControlLaw], period: 
     if name == LQR_INTEGRAL:
         return ManyLqrIntegral(laws)
     if name != CORRECTED:
-        raise InputError(f"controller '{name}' is flown one at a time; use `sim-bridge fly`")
+        return OneByOne(laws, plans, period)
     from trueflight.sim_bridge.many.corrected import ManyCorrected
 
     return ManyCorrected(laws, plans, period)

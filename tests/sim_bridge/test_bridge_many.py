@@ -269,6 +269,23 @@ def test_the_corrected_cascade_with_its_guard(vehicle: Vehicle, design: Design) 
     assert [text.startswith("tripped") for text in told[3:]] == [True, True, True], told
 
 
+def test_controllers_without_a_form_for_arrays(vehicle: Vehicle, design: Design) -> None:
+    others = [name for name in contract.CONTROLLERS if name not in ("lqr", "lqr_integral", "corrected")]
+    plans = [
+        Plan(
+            vehicle,
+            design,
+            SHORT,
+            choose(["rotor_drag"], vehicle, i),
+            i,
+            controller=name,
+            settle=0.2 * (i % 2),
+        )
+        for i, name in enumerate(others)
+    ]
+    each_is_as_alone([*plans, Plan(vehicle, design, SHORT)])
+
+
 def test_many_flights_of_one_model(vehicle: Vehicle, design: Design) -> None:
     onnx = drag_model(0.4, metadata={contract.KEY_ACTUATION: KNOWN})
     each_is_as_alone(
