@@ -41,7 +41,10 @@ def _drawing(command: Callable[..., Any], recording: str) -> Callable[..., Any]:
     """The command, which draws its recording where a picture is asked for."""
     plain = inspect.signature(command)
     hints = get_type_hints(command, include_extras=True) | {"png": PngOption}
-    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in plain.parameters.values()]
+    parameters = [
+        p.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[p.name])
+        for p in plain.parameters.values()
+    ]
     added = inspect.Parameter("png", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=PngOption)
     after = next(k for k, p in enumerate(parameters, 1) if p.name == recording)
 
