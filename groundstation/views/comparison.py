@@ -46,7 +46,9 @@ def comparison_panel(
         for k in _drawn(comparisons)
     ]
     name = f"residual over the whole flight, RMS over {SMOOTHING:g} s, m/s²"
-    residual = error_curves(stream, f"{root}residual", errors, name, () if where is None else where.worst)
+    residual = error_curves(
+        stream, f"{root}residual", errors, name, () if where is None else where.worst, height=370.0
+    )
     text(stream, f"{root}errors", _summary(comparisons) if markdown is None else markdown)
     right = (rrb.TextDocumentView(origin=f"{root}errors", name="errors"), residual)
     return rrb.Horizontal(

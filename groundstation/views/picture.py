@@ -22,6 +22,7 @@ SIZE = (1600, 900)
 """Pixels."""
 STARTED_WITHIN, STILL_WITHIN = 60.0, 60.0  # s
 PACE = 0.5  # s between two looks
+NOTICES = 7.0  # s for which the viewer tells of itself over what it draws
 
 
 def draw(recording: Path, picture: Path, rerun: str, size: tuple[int, int] = SIZE) -> None:
@@ -35,11 +36,11 @@ def draw(recording: Path, picture: Path, rerun: str, size: tuple[int, int] = SIZ
     ):
         viewer.open(str(recording.resolve()))
         viewer.set_time(play_state="paused")
-        before, end = b"", time.monotonic() + STILL_WITHIN
-        while time.monotonic() < end:  # what the viewer has to say of itself goes away by and by
+        before, opened = b"", time.monotonic()
+        while (since := time.monotonic() - opened) < STILL_WITHIN:
             time.sleep(PACE)
             seen = viewer.take_screenshot()
-            if seen == before:
+            if seen == before and since > NOTICES:
                 break
             before = seen
         partial.write_bytes(seen)

@@ -53,6 +53,7 @@ def waterfall_panel(
             f"{root}versions",
             [(e.comparison.label, e, of_version(k, 2)) for k, (_, e) in enumerate(errors)],
             f"residual on the {which}, RMS over {SMOOTHING:g} s, m/s²",
+            height=262.0,
         ),
         row_shares=[2.4, 3, 3],
     )
