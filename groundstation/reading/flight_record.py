@@ -57,7 +57,7 @@ def flight_of_record(
     on_disk: bool = True,
 ) -> Flight:
     """The flight of a `record` of the vehicle `believed`, as `read_flight_record`; `path` is its name in messages, and
-    a file where it is `on_disk`."""
+    a file where it is `on_disk`; the record has no ticks any more then."""
     ticks, foreign = _of_the_vehicle(path, record.ticks)
     columns = {name: ticks[name] for name in COLUMNS if name in ticks and not _unknown(ticks[name])}
     if "battery_voltage" in columns and not np.any(columns["battery_voltage"] > 0):
@@ -84,7 +84,9 @@ def flight_of_record(
             "take another one (`groundstation flights DIR`)"
         )
     notes = (*record.notes, *foreign, *_trip(ticks["guard"], t))
-    del record, ticks  # an hour of them is large: what is not looked at must not stay
+    if on_disk:  # an hour of them is large: what is not looked at must not stay
+        record.ticks.clear()
+    del ticks
     return assemble(
         path,
         believed,

@@ -237,6 +237,9 @@ def _renamed(topic: Topic) -> Topic:
     return Topic(estimated.get(topic.name, topic.name), topic.t, fields, topic.instance)
 
 
+_READ = io.BufferedReader.read  # asked for several times a message: `super()` alone is a tenth of the reading
+
+
 class _Stream(io.BufferedReader):
     """A file in which a step back after a read that met the end is as long as what was read.
 
@@ -247,8 +250,11 @@ class _Stream(io.BufferedReader):
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Bytes from here on; how many of those asked for were missing is remembered."""
-        data = super().read(size)
-        self.missing = max(0, (size or 0) - len(data))
+        data = _READ(self, size)
+        if len(data) != size:
+            self.missing = max(0, (size or 0) - len(data))
+        elif self.missing:
+            self.missing = 0
         return data
 
     def seek(self, target: int, whence: int = 0, /) -> int:
