@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from trueflight.groundstation.study.controllers import Cell, Disturbance
 
 console = Terminal()
+FINISHED = "finished"
 MEASURES = {"reference": "to the reference", "linear": "to the linear behaviour"}
 
 
@@ -84,7 +85,7 @@ def compare_controllers(
     for one in flights:
         console.print(f"{one.name}: {one.title}", style="dim", highlight=False)
     for cell in cells:
-        if cell.outcome != "finished":
+        if cell.outcome != FINISHED:
             console.print(
                 f"vehicle {cell.seed}, {cell.disturbance}, {cell.controller}: {cell.outcome}", style="yellow"
             )
@@ -127,7 +128,7 @@ def _medians(cells: Sequence[Cell], disturbance: str, measure: str) -> dict[str,
     found = {}
     for name in dict.fromkeys(c.controller for c in cells):
         here = [c for c in cells if (c.disturbance, c.controller) == (disturbance, name)]
-        if here and all(c.outcome == "finished" for c in here):
+        if here and all(c.outcome == FINISHED for c in here):
             found[name] = statistics.median(getattr(c, measure) for c in here)
     return found
 

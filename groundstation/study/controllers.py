@@ -11,6 +11,7 @@ Science Robotics 7 (2022).
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -75,7 +76,8 @@ EFFECTS_ALONE = "corrected, effects"
 
 @dataclass(frozen=True)
 class Cell:
-    """One flight: RMSE (m, over three axes) to the `reference` and to the `linear` behaviour, and how it ended."""
+    """One flight: RMSE (m, over three axes) to the `reference` and the `linear` behaviour, and how it ended; NaN where
+    that was early."""
 
     seed: int
     disturbance: str
@@ -160,16 +162,12 @@ def _flown(asked: Asked, seed: int, prepared: Prepared | None, disturbance: Dist
     else:
         command += ["--controller", name]
     report = run_json(command)
-    tracked = track_file(record)
-    off = np.linalg.norm(tracked.position - tracked.reference, axis=1)
-    cell = Cell(
-        seed,
-        disturbance.name,
-        name,
-        float(np.sqrt(np.mean(off**2))),
-        tracked.rms,
-        report["outcome"],
-    )
+    reference = linear = math.nan
+    if report["outcome"] == "finished":
+        tracked = track_file(record)
+        off = np.linalg.norm(tracked.position - tracked.reference, axis=1)
+        reference, linear = float(np.sqrt(np.mean(off**2))), tracked.rms
+    cell = Cell(seed, disturbance.name, name, reference, linear, report["outcome"])
     write_whole(kept, json.dumps(asdict(cell)), "what was flown")
     record.unlink()
     record.with_suffix(".sealed").unlink(missing_ok=True)  # the simulator's answer is not looked at here

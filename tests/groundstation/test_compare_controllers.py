@@ -39,6 +39,19 @@ def test_two_controllers_in_a_wind_are_told_in_both_measures_and_kept(tmp_path: 
     assert len(cells) == 2 and all(Cell(**json.loads(c.read_text())).outcome == "finished" for c in cells)
 
 
+def test_flight_that_is_lost_at_once_is_told_and_has_no_figures(tmp_path: Path) -> None:
+    words = asked(
+        tmp_path, "--controller", "lqr", "--disturbance", "eight-12.1", "--hidden", "parasitic_drag:0.3"
+    )
+    for _ in range(2):  # flown, and kept
+        done = programs.run("groundstation", *words, "--json", cwd=tmp_path)
+        told = valid("groundstation compare-controllers", json.loads(done.stdout))
+        (flight,) = told["flights"]
+        assert flight["outcome"] in ("lost", "crashed") and flight["reference"] is None
+        assert told["median"]["linear"]["eight-12.1"] == {}
+    assert "lost" in programs.run("groundstation", *words, cwd=tmp_path).stdout
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
