@@ -117,17 +117,22 @@ def import_command(
 ) -> None:
     """Read any flight, check it, and write it in the project's own format with its vehicle file beside it.
 
-    From an autopilot's log (ULog, ArduPilot) a vehicle file can be drafted first: `--draft-vehicle vehicle.toml`.
+    Alone it tells what the flight holds and writes nothing. From an autopilot's log (ULog, ArduPilot) a vehicle file
+    can be drafted first: `--draft-vehicle vehicle.toml`.
     """
     from trueflight.groundstation.output.as_json import draft_table, imported_table
     from trueflight.groundstation.reading import read_flight
     from trueflight.groundstation.reading.writing import write_flight
     from trueflight.groundstation.versions.vehicle_draft import draft_of, write_draft
 
-    if check:
-        if output is not None or draft is not None:
-            raise InputError("--check writes nothing; leave out -o and --draft-vehicle, or --check")
-        _tell_consistency(read_flight(file, vehicle, mapping), as_json)
+    if check and (output is not None or draft is not None):
+        raise InputError("--check writes nothing; leave out -o and --draft-vehicle, or --check")
+    if output is None and draft is None:
+        if mass is not None:
+            raise InputError(
+                "--mass goes with --draft-vehicle; a vehicle file of your own tells its mass itself"
+            )
+        _summarise(file, vehicle, mapping, check, as_json)
         return
     _check_import(file, output, vehicle, draft, mass)
     told: dict[str, Any] = {}
@@ -154,6 +159,46 @@ def import_command(
         print_notes(console, flight)
 
 
+def _summarise(
+    file: Path, vehicle: Path | None, mapping: list[str] | None, check: bool, as_json: bool
+) -> None:
+    """Tell what a flight holds and whether its columns agree; a log without a vehicle file is read with the
+    vehicle that the log itself tells of."""
+    from trueflight.groundstation.reading import read_flight
+    from trueflight.groundstation.reading.flight_file import NoVehicle
+    from trueflight.groundstation.reading.listing import SENSORS
+    from trueflight.groundstation.versions.vehicle_draft import LOADERS, draft_vehicle
+
+    drafted = False
+    with working(console, f"reading {escape(file.name)}", as_json):
+        try:
+            flight = read_flight(file, vehicle, mapping)
+        except NoVehicle:
+            load = LOADERS.get(file.suffix.lower())
+            if check or load is None:
+                raise
+            flight, drafted = read_flight(file, draft_vehicle(load(file), None).vehicle, mapping), True
+    if not as_json and not check:
+        flying = 1.0 if flight.flying is None else float(flight.flying.mean())
+        console.print(
+            f"[bold]{escape(file.name)}[/bold]: {flight.duration:.1f} s at {1 / flight.dt:.0f} Hz, "
+            f"{flying * len(flight) * flight.dt:.1f} s in the air; measured: "
+            + ", ".join(name for column, name in SENSORS.items() if flight.has(column)),
+            highlight=False,
+        )
+    _tell_consistency(flight, as_json)
+    if as_json or check:
+        return
+    follow = f"groundstation diagnose {file}"
+    if drafted:
+        console.print(
+            "no vehicle file beside it: mass and hover thrust are guesses until you draft one and correct it",
+            style="yellow",
+        )
+        follow = f"groundstation import {file} --draft-vehicle {file.with_suffix('.vehicle.toml')}"
+    console.print(f"[bold]next:[/bold] {escape(follow)}", highlight=False, soft_wrap=True)
+
+
 def _tell_consistency(flight: Flight, as_json: bool) -> None:
     from trueflight.groundstation.output.as_json import consistency_table
     from trueflight.groundstation.output.tables import print_consistency
@@ -169,8 +214,6 @@ def _check_import(
     file: Path, output: Path | None, vehicle: Path | None, draft: Path | None, mass: float | None
 ) -> None:
     """Raise `InputError` for options that contradict each other."""
-    if output is None and draft is None:
-        raise InputError("import: say where to write the flight with -o FILE.csv, or draft its vehicle file")
     if output is not None and output.resolve() == file.resolve():
         raise InputError(f"{output}: that is the file itself; choose another -o, the original stays as it is")
     if mass is not None and draft is None:

@@ -73,7 +73,7 @@ def drifting(verdict: EffectVerdict, drift: Drift) -> EffectVerdict:
     """The verdict on an effect that drifts: its course tells that it is there, and what else could take it."""
     others = tuple(dict.fromkeys((*verdict.indistinguishable_from, *drift.rivals)))
     sure = not drift.rivals and not verdict.rests_on and not verdict.undetermined
-    advice = f"add what holds now: groundstation model add {verdict.name}" if sure else verdict.advice
+    advice = "add what holds now to the model" if sure else verdict.advice
     return replace(
         verdict, verdict=MISSING if sure else POSSIBLE, indistinguishable_from=others, advice=advice
     )

@@ -316,4 +316,4 @@ def _tell(others: Sequence[str], effect: Effect) -> str:
 
 def _add(effect: Effect) -> str:
     alias = f"; no flight can tell it from {', '.join(effect.aliases)}" if effect.aliases else ""
-    return f"add it: groundstation model add {effect.name}{alias}"
+    return f"add it to the model{alias}"

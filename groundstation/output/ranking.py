@@ -112,7 +112,7 @@ def _block(d: Diagnosis, e: EffectVerdict) -> Iterator[Text]:
         yield Text(f"not told from {', '.join(e.indistinguishable_from)}", style="yellow")
     if e.rests_on:
         yield Text(e.rests_on, style="dim")
-    advice = e.advice.removeprefix(f"add it: groundstation model add {e.name}").removeprefix("; ")
+    advice = e.advice.removeprefix("add it to the model").removeprefix("; ")
     if advice and not advice.startswith("no flight can tell it from"):  # told above
         yield Text(advice, style="dim")
 

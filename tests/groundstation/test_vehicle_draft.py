@@ -1,6 +1,7 @@
 """A vehicle file drafted from a log: what the log tells, where from, and what it cannot tell."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -105,7 +106,7 @@ def test_import_drafts_reads_and_says_what_is_missing(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((), "-o FILE.csv"),
+        (("--mass", "1"), "--draft-vehicle"),
         (("--mass", "1", "-o", "x.csv"), "--draft-vehicle"),
         (("--draft-vehicle", "v.toml", "--vehicle", "w.toml"), "leave out --vehicle"),
         (("--draft-vehicle", "f.vehicle.toml", "-o", "f.csv"), "name the draft otherwise"),
@@ -127,3 +128,18 @@ def test_a_csv_has_no_parameters_to_draft_from(tmp_path):
     (tmp_path / "flight.csv").write_text("t,x\n0,1\n")
     done = groundstation("import", tmp_path / "flight.csv", "--draft-vehicle", tmp_path / "v.toml")
     assert done.returncode == 2 and "only an autopilot's log" in done.stderr
+
+
+def test_import_alone_tells_what_a_log_holds_and_writes_nothing(tmp_path: Path) -> None:
+    log = shutil.copy(
+        Path(__file__).parents[2] / "samples" / "px4" / "sih_lemniscate.ulg", tmp_path / "flight.ulg"
+    )
+    done = programs.run("groundstation", "import", str(log), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "in the air; measured: accelerometer" in done.stdout
+    assert "agrees" in done.stdout and "guesses until you draft one" in done.stdout
+    command = done.stdout.strip().splitlines()[-1].removeprefix("next: groundstation ")
+    assert [path.name for path in tmp_path.iterdir()] == ["flight.ulg"]
+    again = programs.run("groundstation", *command.split(), cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "flight.vehicle.toml").is_file()
