@@ -109,9 +109,14 @@ def _print(left: Unexplained, d: Diagnosis, path: Path | None, flight: Path) -> 
             f"{told}nothing in it can be predicted", style="bold yellow" if beyond else "bold green"
         )
     else:
+        chance = (
+            f"by chance with a probability of at most {left.p_value:.2g}"
+            if left.p_value < 0.05
+            else "too short a flight to rule out chance"
+        )
         console.print(
             f"none of these explains the rest: {percent(left.variance_share)} of it can be predicted on held-out parts "
-            f"(by chance with a probability of at most {left.p_value:.2g})",
+            f"({chance})",
             style="bold yellow",
         )
     for text in left.where:
