@@ -196,7 +196,8 @@ def begin_record(
 
 
 def end_record(writer: Writer, ticks: int, events: int, dropped: int) -> None:
-    """What stands in a record behind the last tick: how many messages there are, and the index."""
+    """What stands in a record behind the last tick: how many `ticks` and `events` there are, how many were `dropped`,
+    and the index."""
     counts = {"dropped": dropped, "ticks": ticks, "events": events}
     writer.add_metadata("end", {key: str(value) for key, value in counts.items()})
     writer.finish()

@@ -7,6 +7,8 @@ from typing import Any
 
 # Before numpy is loaded, here and in every process that a test starts: with a worker a core, threads only disturb.
 os.environ.update({f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")})
+# GNU readline, which pytest loads, sets it for child processes: the tests' workers.
+os.environ.pop("COLUMNS", None)
 
 import pytest
 from groups import group_of, realtime

@@ -8,7 +8,10 @@ import pytest
 from trueflight.models.effects import catalogue
 
 ROOT = Path(__file__).parent.parent
-SCENARIOS = {("groundstation/study/reproduce.py", "wind")}
+SCENARIOS = {
+    ("groundstation/study/reproduce.py", "wind"),
+    ("groundstation/study/controllers.py", "wind"),
+}
 """The name of an experiment, which is what its flights are flown in."""
 
 

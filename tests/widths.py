@@ -12,7 +12,7 @@ from typing import Any
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from trueflight.models.terminal import Table, Terminal
+from trueflight.models.terminal import PIPE, Table, Terminal
 
 WIDTHS = (60, 80, 100, 160)
 WORD = re.compile(r"[^\s\u2500-\u259f]+")
@@ -29,7 +29,7 @@ def whole_at_every_width() -> Iterator[list[RichTable]]:
             return  # progress, which is gone when it is done
         tables.extend(one for one in objects if isinstance(one, RichTable))
         assert all(isinstance(one, Table) for one in objects if isinstance(one, RichTable))
-        piped = words(_printed(plain, None, *objects, **how))
+        piped = words(_printed(plain, PIPE, *objects, **how))
         for width in WIDTHS:
             text = _printed(plain, width, *objects, **how)
             lost = piped - words(text)
@@ -51,7 +51,7 @@ def words(text: str) -> Counter[str]:
     return Counter(word.rstrip(":") for word in WORD.findall(text) if word.rstrip(":"))
 
 
-def _printed(plain: Any, width: int | None, *objects: Any, **how: Any) -> str:
+def _printed(plain: Any, width: int, *objects: Any, **how: Any) -> str:
     page = io.StringIO()
     plain(Terminal(width=width, file=page), *objects, **how)
     return page.getvalue()

@@ -240,7 +240,8 @@ def simulate_many(
     Each of `flights` names the options of its flight, as columns of `sim-bridge fly-many --flights` do: `trajectory`,
     `hidden`, `seed`, `noise`, `controller`, `name` and so on, several texts as a sequence ("excitation" where there is
     no `trajectory`). `vehicle` is the vehicle.toml of those that name none; `jobs` processes fly, one for each core
-    with 0. All are flown before the first is read.
+    with 0. All are flown before the first is read. Numbers of the table are in SI units, as options of `sim-bridge
+    fly` are.
 
     It runs `sim-bridge`, the program. Raises `InputError` for whatever that refuses.
     """

@@ -308,8 +308,8 @@ def fly_all(
     missing = [task for task in arms if known[_stem(*task)] is None]
     reports: dict[str, dict[str, Any]] = {}
     if missing:
-        for task in missing:  # of a run that was killed before it could tell
-            (folder / f"{_stem(*task)}.mcap").unlink(missing_ok=True)
+        for task in missing:
+            _clear(folder / _stem(*task))
         table = folder / "flights.csv"
         write_whole(table, table_of(prepared, truth, missing), "the table of flights")
         words: list[object] = ["sim-bridge", "fly-many", "--flights", table, "--vehicle", vehicle]
@@ -320,9 +320,9 @@ def fly_all(
     def one(task: tuple[Scenario, Arm]) -> Flown:
         scenario, arm = task
         stem = _stem(scenario, arm)
-        flown = known[stem] or _kept(
-            folder / stem, lambda _: _judged(folder, prepared, scenario, arm, reports[stem])
-        )
+        flown = known[stem]
+        if flown is None:
+            flown = _keep(folder / stem, _judged(folder, prepared, scenario, arm, reports[stem]))
         advance()
         return flown
 
@@ -364,7 +364,16 @@ def _kept(path: Path, fly: Callable[[Path], Flown]) -> Flown:
     """What is known of the flight at `path` (without suffix), flown now where nothing is."""
     if (known := _known(path)) is not None:
         return known
-    flown = fly(path)
+    _clear(path)
+    return _keep(path, fly(path))
+
+
+def _clear(path: Path) -> None:
+    """Take away the record of a run that was killed before it could tell."""
+    path.with_name(f"{path.name}.mcap").unlink(missing_ok=True)
+
+
+def _keep(path: Path, flown: Flown) -> Flown:
     write_whole(path.with_name(f"{path.name}.json"), json.dumps(asdict(flown)), "what was flown")
     return flown
 

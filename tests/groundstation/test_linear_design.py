@@ -333,7 +333,7 @@ def test_tracking_tells_a_flight_with_drag_from_one_without(records, capsys):
     for axis in "xy":
         assert after["mse"][axis] < 0.2 * before["mse"][axis]
     assert after["change"] < -0.6
-    assert [before["label"], after["label"]] == ["drag: lemniscate", "none: lemniscate"]
+    assert [before["label"], after["label"]] == ["drag: lemniscate lqr", "none: lemniscate lqr"]
     # With nothing hidden the vehicle flies as designed, to what delay and noise leave.
     assert after["rms"] < 0.06
 

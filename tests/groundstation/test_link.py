@@ -164,7 +164,7 @@ BAD_COMMANDS = {
     "unknown trajectory": (["fly", "circel"], ["no trajectory 'circel'", "did you mean 'circle'"]),
     "unknown parameter": (["fly", "circle", "--set", "sped=2"], ["no parameter 'sped'"]),
     "no value": (["fly", "circle", "--set", "speed"], ["write NAME=VALUE"]),
-    "unknown controller": (["fly", "circle", "--controller", "pid"], ["choose one of lqr"]),
+    "unknown controller": (["fly", "circle", "--controller", "pid"], ["use one of lqr"]),
     "no setpoints": (["fly", "nothing.csv"], ["cannot read the setpoints", "check the path"]),
     "no model": (["deploy", "nothing.onnx"], ["nothing.onnx", "model export"]),
     "model is no ONNX": (
