@@ -81,7 +81,9 @@ def test_template_is_ranked_fitted_added_and_exported(flight_with_tether: Path, 
 
 def test_an_import_by_its_old_name_is_told_with_the_new_one(tmp_path, monkeypatch) -> None:
     (tmp_path / "old.py").write_text("from models.effect import Effect\n")
-    monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(ROOT))])
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if Path(p).resolve() != ROOT.resolve()])
+    for name in [n for n in sys.modules if n.split(".")[0] == "models"]:  # another test's
+        monkeypatch.delitem(sys.modules, name)
     with pytest.raises(InputError, match=r"old\.py: no module 'models.*; import it from trueflight\.models"):
         catalogue(str(tmp_path))
 
