@@ -38,6 +38,7 @@ from trueflight.companion.law.geometric import Geometric
 from trueflight.companion.law.guard import Correction
 from trueflight.companion.law.indi import Indi
 from trueflight.companion.law.l1_adaptive import L1Adaptive
+from trueflight.companion.law.outer_loop import AUTHORITY, LONGEST_STEP
 from trueflight.companion.law.px4_cascade import Px4Cascade
 from trueflight.companion.law.steps import Controller, Preview
 from trueflight.models.contract import CORRECTED, GEOMETRIC, INDI, L1_ADAPTIVE, LQR, LQR_INTEGRAL, PX4_CASCADE
@@ -48,8 +49,7 @@ from trueflight.models.vehicle import GRAVITY
 
 AHEAD = 0.02
 """s over which the correction's rate of change is taken, where no lag asks for more."""
-LONGEST_STEP = 0.1  # s of integration and fading in one tick, so that a gap in the odometry gives no jump
-INTEGRAL_AUTHORITY = 3.0  # m/s², the most that the integral of `lqr_integral` may ask for per axis
+INTEGRAL_AUTHORITY = AUTHORITY  # m/s², the most that the integral of `lqr_integral` may ask for per axis
 
 
 class Corrector(Protocol):

@@ -19,7 +19,7 @@ from trueflight.companion.law.control import (
 from trueflight.models.trajectory import ReferenceSample
 from trueflight.models.vehicle import GRAVITY
 
-LONGEST_STEP = 0.1  # s of integration in one tick, so that a gap in the odometry gives no jump
+LONGEST_STEP = 0.1  # s of integration and fading in one tick, so that a gap in the odometry gives no jump
 AUTHORITY = 3.0
 """m/s², the most that an adaptive part may add on an axis of the world: that of the integral of `lqr_integral`."""
 

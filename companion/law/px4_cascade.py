@@ -51,11 +51,8 @@ class Px4Cascade:
         asked, error = self._asked(state, reference, dt)
         attitude = self._loop.attitude(asked, zeta[2])
         if not law.at_limit(attitude):
-            self._integral = tuple(  # type: ignore[assignment]
-                i + dt * k * e for i, k, e in zip(self._integral, INTEGRAL, error, strict=True)
-            )
-        x, y, z = self._integral
-        self._integral = (x, y, min(GRAVITY, max(-GRAVITY, z)))
+            x, y, z = (i + dt * k * e for i, k, e in zip(self._integral, INTEGRAL, error, strict=True))
+            self._integral = (x, y, min(GRAVITY, max(-GRAVITY, z)))
         rates = _turning(state.quaternion, _quaternion(attitude.roll, attitude.pitch, reference.yaw))
         limit, yaw_limit = law.limits.body_rate, law.limits.yaw_rate
         p, q, r = rates

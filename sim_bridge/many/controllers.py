@@ -8,7 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from trueflight.companion.law.control import ControlLaw
-from trueflight.companion.law.controllers import INTEGRAL_AUTHORITY, LONGEST_STEP, LqrIntegral
+from trueflight.companion.law.controllers import INTEGRAL_AUTHORITY, LqrIntegral
+from trueflight.companion.law.outer_loop import LONGEST_STEP
 from trueflight.models.vehicle import GRAVITY
 from trueflight.sim_bridge.many.across import stacked
 from trueflight.sim_bridge.many.cascade import Cascades, States, Steps, euler, to_heading

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from trueflight.companion.law.control import ControlLaw
-from trueflight.companion.law.controllers import AHEAD, LONGEST_STEP
+from trueflight.companion.law.controllers import AHEAD
+from trueflight.companion.law.outer_loop import LONGEST_STEP
 from trueflight.models.vehicle import GRAVITY
 from trueflight.sim_bridge.many.actuation import LagInverses, RateModels
 from trueflight.sim_bridge.many.behaviours import Behaviours
