@@ -161,8 +161,9 @@ def test_what_it_adds_is_bounded_whatever_is_measured(name: str) -> None:
     assert all(map(math.isfinite, (*step.command.body_rate, step.command.thrust)))
     low, high = LAW.thrust_limits
     assert low <= step.command.thrust <= high
-    for _ in range(3000):  # and it is forgotten again
-        step = controller.step(at_rest(), lambda ahead: reference_at(), DT)
+    for _ in range(3000):  # and it is forgotten again, where the vehicle does what it is asked for
+        felt = (0.0, 0.0, step.command.thrust / VEHICLE.mass)
+        step = controller.step(at_rest()._replace(specific_force=felt), lambda ahead: reference_at(), DT)
     assert step.command.thrust == pytest.approx(VEHICLE.weight, rel=0.35)
 
 

@@ -41,7 +41,7 @@ def test_two_controllers_in_a_wind_are_told_in_both_measures_and_kept(tmp_path: 
 
 def test_flight_that_is_lost_at_once_is_told_and_has_no_figures(tmp_path: Path) -> None:
     words = asked(
-        tmp_path, "--controller", "lqr", "--disturbance", "eight-12.1", "--hidden", "parasitic_drag:0.3"
+        tmp_path, "--controller", "lqr", "--disturbance", "eight-12.1", "--hidden", "transport_delay:0.4"
     )
     for _ in range(2):  # flown, and kept
         done = programs.run("groundstation", *words, "--json", cwd=tmp_path)
