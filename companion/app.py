@@ -99,7 +99,9 @@ class Companion:
         self._vehicle_time_us = self._errors_told = 0
         self._told_by_autopilot = ""
         self.vehicle = vehicle
-        self.flight = FlightStateMachine(law, settings.safety, self.emit, settings.trim, settings.agreement)
+        self.flight = FlightStateMachine(
+            law, settings.safety, self.emit, settings.trim, settings.agreement, settings.observer
+        )
         self._direct(settings, design, store)
         self._open(session, settings, records)
         if plan.exposed:

@@ -16,7 +16,8 @@ from collections.abc import Callable
 from trueflight.companion.agreement import Agreement, AgreementLimits
 from trueflight.companion.latest import Latest
 from trueflight.companion.law.control import IDLE_STEP, ControlLaw, State
-from trueflight.companion.law.controllers import TrimLimits
+from trueflight.companion.law.controllers import BLIND, TrimLimits
+from trueflight.companion.law.residual import ObserverLimits
 from trueflight.companion.law.watch import Watch
 from trueflight.companion.mission import Mission
 from trueflight.companion.odometry import Odometry
@@ -43,10 +44,11 @@ class FlightStateMachine:
         on_event: Callable[[str, str, str], None] = lambda level, kind, text: None,
         trim: TrimLimits | None = None,
         agreement: AgreementLimits | None = None,
+        observer: ObserverLimits | None = None,
     ) -> None:
         self.sent = self.ticked = 0
         self.agrees = Agreement(agreement or AgreementLimits())
-        self._phases = Phases(law, safety, on_event, trim or TrimLimits())
+        self._phases = Phases(law, safety, on_event, trim or TrimLimits(), observer or ObserverLimits())
         self._course = self._phases.course
         self.models = self._phases.models
         self._safety, self._on_event = safety, on_event
@@ -255,7 +257,7 @@ class FlightStateMachine:
             out.position[2],
             latest.battery_voltage,
             odometry.angular_velocity,
-            latest.specific_force if guard is not None else None,
+            latest.specific_force if mission.controller not in BLIND else None,
         )
         assert controller is not None
         out.step = controller.step(state, self._course.preview, out.interval)

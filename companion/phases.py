@@ -13,6 +13,7 @@ from trueflight.companion.course import Course
 from trueflight.companion.latest import Latest
 from trueflight.companion.law.control import ControlLaw, euler
 from trueflight.companion.law.controllers import Controller, TrimLimits, make_controller
+from trueflight.companion.law.residual import ObserverLimits
 from trueflight.companion.mission import Mission, legs_of, stay, way_home
 from trueflight.companion.odometry import Odometry
 from trueflight.companion.outcome import IDLE, LANDING, MISSION, SILENT, TAKEOFF
@@ -28,7 +29,12 @@ class Phases:
     """
 
     def __init__(
-        self, law: ControlLaw, safety: Safety, on_event: Callable[[str, str, str], None], trim: TrimLimits
+        self,
+        law: ControlLaw,
+        safety: Safety,
+        on_event: Callable[[str, str, str], None],
+        trim: TrimLimits,
+        observer: ObserverLimits,
     ) -> None:
         self.phase = IDLE
         self.mission: Mission | None = None
@@ -38,7 +44,8 @@ class Phases:
         self.handed_over = False
         self.course = Course()
         self.models = Succession(law.vehicle, on_event)
-        self._law, self._safety, self._trim, self._on_event = law, safety, trim, on_event
+        self._law, self._safety, self._on_event = law, safety, on_event
+        self._trim, self._observer = trim, observer
 
     @property
     def flying(self) -> bool:
@@ -49,7 +56,9 @@ class Phases:
         """Stream idle setpoints for this mission, until `take_off`."""
         self.mission, self.phase, self.outcome = mission, TAKEOFF, ""
         self.models.begin(mission.guard)
-        self.controller = make_controller(mission.controller, self._law, mission.guard, self._trim)
+        self.controller = make_controller(
+            mission.controller, self._law, mission.guard, self._trim, self._observer
+        )
         self.course.clear()
         self.wants_land, self.handed_over = False, False
 

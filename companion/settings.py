@@ -11,6 +11,7 @@ from trueflight.companion.address import checked_address
 from trueflight.companion.agreement import AgreementLimits
 from trueflight.companion.law.control import Limits
 from trueflight.companion.law.controllers import TrimLimits
+from trueflight.companion.law.residual import ObserverLimits
 from trueflight.companion.law.watch import GuardLimits
 from trueflight.companion.pose import PoseSettings
 from trueflight.companion.shadow import ShadowLimits
@@ -51,6 +52,7 @@ class Settings:
     guard: GuardLimits = field(default_factory=GuardLimits)
     shadow: ShadowLimits = field(default_factory=ShadowLimits)
     trim: TrimLimits = field(default_factory=TrimLimits)
+    observer: ObserverLimits = field(default_factory=ObserverLimits)
     agreement: AgreementLimits = field(default_factory=AgreementLimits)
     pose: PoseSettings = field(default_factory=PoseSettings)
     realtime: int = field(default=0, metadata={"zero": True})

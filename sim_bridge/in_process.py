@@ -79,7 +79,8 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     vehicle.
     """
     guard, steps = _guard(plan), plan.steps_per_tick
-    controller = make_controller(plan.controller, ControlLaw(plan.vehicle, plan.design), guard, plan.trim)
+    law = ControlLaw(plan.vehicle, plan.design)
+    controller = make_controller(plan.controller, law, guard, plan.trim, plan.observer)
     simulator = _in_hover(plan)
     ground = simulator.world.standing_height
     period = steps * PHYSICS_STEP

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from trueflight.companion.law.controllers import TrimLimits
+from trueflight.companion.law.residual import ObserverLimits
 from trueflight.models.contract import CORRECTED, LQR
 from trueflight.models.design import Design, load_design
 from trueflight.models.errors import InputError
@@ -47,6 +48,7 @@ class Plan:
     controller: str = ""
     settle: float = 0.0
     trim: TrimLimits = field(default_factory=TrimLimits)
+    observer: ObserverLimits = field(default_factory=ObserverLimits)
     rotor_speeds: bool = True
 
     def __post_init__(self) -> None:

@@ -72,7 +72,8 @@ class ControlStep(NamedTuple):
 
     `thrust_command` is the normalised collective (0 to 1) of `command.thrust`. `correction` and
     `correction_raw` are error accelerations in m/s², heading frame: all that was applied, and what the live model
-    returned. `trim` is the part of the correction that comes from the trim, not from a model.
+    returned. `trim` is the part of the correction that comes from the disturbance observer and the slow trim, not
+    from a model.
     """
 
     feedback: Command

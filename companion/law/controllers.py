@@ -2,7 +2,8 @@
 
 * `lqr`: the linear cascade alone.
 * `lqr_integral`: the cascade with an integral in the position loop, the paper's third controller.
-* `corrected`: the cascade with the learned correction (22), the inverse of the known actuation, and a slow trim.
+* `corrected`: the cascade with the learned correction (22), the inverse of the known actuation, a
+  disturbance observer and a slow trim.
 * `indi`, `l1_adaptive`, `geometric`, `px4_cascade`: after other papers, to compare with; each in its own module.
 
 The correction has to arrive as an acceleration, so what lies between command and acceleration is undone where
@@ -11,7 +12,8 @@ cascade is evaluated for the moment at which its command will act, the rate loop
 attitude asked for the correction c is led by the attitude loop itself: `zeta_ref = u* + c + c_dot / K_zeta` makes
 `zeta - c` follow `u*` as the linear design does. The model is asked at the attitude that the vehicle will have,
 which is what it was fitted to, not at the one asked for; that also leaves no equation to be solved for u. Of the
-height it is told the expected one: see `Corrected._ahead`.
+height it is told the expected one: see `Corrected._ahead`. What the model does not know is seen by a disturbance
+observer and, more slowly, by the trim.
 """
 
 from __future__ import annotations
@@ -32,7 +34,6 @@ from trueflight.companion.law.control import (
     Vector,
     euler,
     features,
-    world_from_body,
 )
 from trueflight.companion.law.geometric import Geometric
 from trueflight.companion.law.guard import Correction
@@ -40,6 +41,7 @@ from trueflight.companion.law.indi import Indi
 from trueflight.companion.law.l1_adaptive import L1Adaptive
 from trueflight.companion.law.outer_loop import AUTHORITY, LONGEST_STEP
 from trueflight.companion.law.px4_cascade import Px4Cascade
+from trueflight.companion.law.residual import DisturbanceObserver, ObserverLimits
 from trueflight.companion.law.steps import Controller, Preview
 from trueflight.models.contract import CORRECTED, GEOMETRIC, INDI, L1_ADAPTIVE, LQR, LQR_INTEGRAL, PX4_CASCADE
 from trueflight.models.controllers import check_controller, plug_ins
@@ -49,6 +51,8 @@ from trueflight.models.vehicle import GRAVITY
 
 AHEAD = 0.02
 """s over which the correction's rate of change is taken, where no lag asks for more."""
+BLIND = (LQR, LQR_INTEGRAL)
+"""Those that do not look at the accelerometer, which takes time to read."""
 INTEGRAL_AUTHORITY = AUTHORITY  # m/s², the most that the integral of `lqr_integral` may ask for per axis
 
 
@@ -73,7 +77,7 @@ class Corrector(Protocol):
         ...
 
     def step(self, rows: Sequence[list[float]], ahead: float, dt: float, height: float) -> Correction:
-        """The correction for three rows of features: when tilt acts, `ahead` s later, and when thrust acts.
+        """The correction for four rows of features: when tilt acts, `ahead` s later, when thrust acts, and now.
 
         `height` above the ground, m, is the measured one.
         """
@@ -98,12 +102,13 @@ def make_controller(
     law: ControlLaw,
     corrector: Corrector | None = None,
     trim: TrimLimits | None = None,
+    observer: ObserverLimits | None = None,
 ) -> Controller:
     """The controller of this name; raises `InputError` for an unknown one or one that lacks what it needs."""
     if name == CORRECTED:
         if corrector is None:
             raise InputError("controller 'corrected' needs a deployed model")
-        return Corrected(law, corrector, trim or TrimLimits())
+        return Corrected(law, corrector, trim or TrimLimits(), observer or ObserverLimits())
     check_controller(name)
     return _ALONE[name](law) if name in _ALONE else _plugged(name, law)
 
@@ -189,12 +194,14 @@ class LqrIntegral:
 
 
 class Corrected:
-    """The cascade with the learned correction, the inverse of the actuation, and the trim.
+    """The cascade with the learned correction, the inverse of the actuation, the disturbance observer and the trim.
 
-    All three fade with the corrector's `engaged`: with nothing engaged it is the cascade, tick for tick.
+    All four fade with the corrector's `engaged`: with nothing engaged it is the cascade, tick for tick.
     """
 
-    def __init__(self, law: ControlLaw, corrector: Corrector, limits: TrimLimits) -> None:
+    def __init__(
+        self, law: ControlLaw, corrector: Corrector, limits: TrimLimits, observer: ObserverLimits
+    ) -> None:
         self._law, self._corrector, self._limits = law, corrector, limits
         k_eta, k_zeta = law.design.K_eta, law.design.K_zeta
         self._tilt_gain = 0.5 * (k_zeta[0][0] + k_zeta[1][1])
@@ -207,6 +214,7 @@ class Corrected:
         self._at_limit = False
         self._command = ZERO
         self._rates, self._inverse = RateModel(corrector.actuation), LagInverse()
+        self._observer = DisturbanceObserver(law, observer)
 
     def start(self) -> None:
         """Expect the linear behaviour from the next tick's state on; what the trim has learned stays."""
@@ -227,8 +235,11 @@ class Corrected:
         self._rates.advance(self._command[:2], dt)
         share = self._faded(corrector.engaged, dt)
         trim = self._trimmed(state, zeta, now, share, dt)
+        acceleration, acting = self._observer.look(state, actuation, dt)
         if share == 0.0 and not self._running and corrector.applied == ZERO:
             self._inverse.reset()
+            self._observer.reset()
+            self._observer.commanded(plain.thrust)
             self._command = plain.body_rate
             return ControlStep(plain, ZERO, ZERO, plain, law.normalised(plain.thrust))
 
@@ -239,10 +250,9 @@ class Corrected:
         turned = _euler_rates(zeta, (turned_x, turned_y, 0.0))
         tilted = (zeta[0] + turned[0], zeta[1] + turned[1], yaw)
 
-        # Three moments: when a rate commanded now acts, a little later, and when a thrust commanded now acts.
+        # Four moments: when a rate commanded now acts, a little later, when a thrust commanded now acts, and now.
         ahead = max(known.rate_lag, AHEAD)
         lift = known.thrust_delay + known.thrust_lag
-        acceleration = _acceleration(state)
         early = self._ahead(state, acceleration, known.rate_delay)
         late = self._ahead(state, acceleration, known.rate_delay + ahead)
         lifted = self._ahead(state, acceleration, lift)
@@ -251,29 +261,30 @@ class Corrected:
         tilt_late = law.feedback(late, yaw, preview(known.rate_delay + ahead))
         thrust = law.feedback(lifted, yaw, preview(lift)).thrust
 
-        before = corrector.applied
-        asked = law.corrected(Attitude(0.0, 0.0, thrust), (0.0, 0.0, before[2] + trim[2])).thrust
+        before = corrector.applied[2] + trim[2] + share * self._observer.pushed[2]
+        asked = law.corrected(Attitude(0.0, 0.0, thrust), (0.0, 0.0, before)).thrust
         voltage = state.battery_voltage if state.battery_voltage > 0.0 else law.vehicle.nominal_voltage
         roll, pitch = tilted[0] + ahead * rates[0], tilted[1] + ahead * rates[1]
         moments = (
             (early, Attitude(tilted[0], tilted[1], asked)),
             (late, Attitude(roll, pitch, asked)),
             (lifted, Attitude(zeta[0] + lift * rates[0], zeta[1] + lift * rates[1], asked)),
+            (state, Attitude(zeta[0], zeta[1], acting)),
         )
         rows = [features(then, yaw, attitude, voltage, corrector.wants_yaw) for then, attitude in moments]
         correction = corrector.step(rows, ahead, dt, state.height)
-        (x, y, z), (trim_x, trim_y, trim_z) = correction.applied, trim
-        x, y, z = x + trim_x, y + trim_y, z + trim_z
+        (u, v, w), (pushing_x, pushing_y) = self._observer.step(zeta, correction.now, dt)
+        trim = (trim[0] + share * u, trim[1] + share * v, trim[2] + share * w)
+        x, y, z = correction.applied
+        x, y, z = x + trim[0], y + trim[1], z + trim[2]
+        slope_x, slope_y = correction.rate[0] + pushing_x, correction.rate[1] + pushing_y
         # The attitude loop takes 1 / K to follow: lead the correction by that much.
-        led = (
-            x + share * correction.rate[0] / self._tilt_gain,
-            y + share * correction.rate[1] / self._tilt_gain,
-        )
+        led = (x + share * slope_x / self._tilt_gain, y + share * slope_y / self._tilt_gain)
         lifted_thrust = law.corrected(Attitude(0.0, 0.0, thrust), (0.0, 0.0, z)).thrust
         attitude = law.corrected(Attitude(tilt.roll, tilt.pitch, lifted_thrust), (led[0], led[1], 0.0))
         later = law.corrected(
             Attitude(tilt_late.roll, tilt_late.pitch, lifted_thrust),
-            (led[0] + ahead * correction.rate[0], led[1] + ahead * correction.rate[1], 0.0),
+            (led[0] + ahead * slope_x, led[1] + ahead * slope_y, 0.0),
         )
         self._at_limit = law.at_limit(attitude)
         wanted = law.euler_rates(tilted, attitude, reference.yaw)
@@ -282,6 +293,7 @@ class Corrected:
         added = self._inverse.step(slope, known.rate_lag, known.rate_integral, dt)
         command = law.turning(zeta, (wanted[0] + added[0], wanted[1] + added[1], wanted[2]), attitude.thrust)
         self._command = command.body_rate
+        self._observer.commanded(command.thrust)
         return ControlStep(plain, (x, y, z), correction.raw, command, law.normalised(command.thrust), trim)
 
     def _ahead(self, state: State, acceleration: Vector, h: float) -> State:
@@ -341,14 +353,6 @@ class Corrected:
         u, v, w = u + c * along - s * across, v + s * along + c * across, w + dt * d * z
         most = self._limits.authority
         self._trim = min(most, max(-most, u)), min(most, max(-most, v)), min(most, max(-most, w))
-
-
-def _acceleration(state: State) -> Vector:
-    """Acceleration in the world, m/s², as the accelerometer has it; none where there is no accelerometer."""
-    if state.specific_force is None:
-        return ZERO
-    x, y, z = world_from_body(state.quaternion, state.specific_force)
-    return x, y, z - GRAVITY
 
 
 def _euler_rates(zeta: Vector, body: Vector) -> Vector:

@@ -17,6 +17,7 @@ from dataclasses import astuple
 from typing import NamedTuple
 
 from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
+from trueflight.companion.law.outer_loop import mixed
 from trueflight.companion.law.watch import ZERO, GuardLimits, Vector, Watch
 
 OFF, FADING_IN, ACTIVE, FADING_OVER, FADING_OUT, TRIPPED = (
@@ -35,12 +36,14 @@ LONGEST_STEP = 0.1
 class Correction(NamedTuple):
     """Error acceleration to cancel, m/s², heading frame: as applied, and as the live model returned it.
 
-    `rate` (m/s³, x and y) is how fast the applied one is about to change.
+    `rate` (m/s³, x and y) is how fast the applied one is about to change. `now` is what the models that act say of this
+    moment, whatever of it is applied yet.
     """
 
     applied: Vector
     rate: tuple[float, float]
     raw: Vector
+    now: Vector = ZERO
 
 
 class Guard:
@@ -152,8 +155,8 @@ class Guard:
     def step(
         self, rows: Sequence[Sequence[float]], ahead: float, dt: float, height: float = math.inf
     ) -> Correction:
-        """The correction for three rows of features: where tilt acts, `ahead` s later, where thrust acts; `dt` s
-        since the last step, `height` in m as measured above the ground.
+        """The correction for four rows of features: where tilt acts, `ahead` s later, where thrust acts, and now; `dt`
+        s since the last step, `height` in m as measured above the ground.
 
         The applied one is finite, within `authority`, and within `slew * dt` of the previous one, always; its rate
         within `slew`.
@@ -163,6 +166,7 @@ class Guard:
         self._fade(dt)
         x, y, z = raw = ZERO
         rx = ry = 0.0
+        all_weights, now = 0.0, ZERO
         for watch, weight in list(self._weights.items()):
             if weight == 0.0 and not (self._running and watch is self._live):
                 continue
@@ -175,9 +179,12 @@ class Guard:
                 continue
             x, y, z = x + weight * look.wanted[0], y + weight * look.wanted[1], z + weight * look.wanted[2]
             rx, ry = rx + weight * look.rate[0], ry + weight * look.rate[1]
+            all_weights += weight
+            if all_weights > 0.0:
+                now = mixed(now, look.now, weight / all_weights)
         self._applied = self._slewed((x, y, min(z, self._most_lift_taken(height))), dt)
         a, b, _ = self.limits.slew
-        return Correction(self._applied, (min(a, max(-a, rx)), min(b, max(-b, ry))), raw)
+        return Correction(self._applied, (min(a, max(-a, rx)), min(b, max(-b, ry))), raw, now)
 
     def _most_lift_taken(self, height: float) -> float:
         """The greatest loss of thrust (m/s²) that models may ask for at this height above the ground, m.

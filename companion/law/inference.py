@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MAX_BYTES = 4 << 20
 """The networks meant here have tens of kilobytes; anything near this is not one of them."""
 TIMING_RUNS = 200
-LOOK_ROWS = 3
+LOOK_ROWS = 4
 """Rows of features that a control tick asks for."""
 _TIMING_LIMIT = 0.5  # s; a model that is that slow needs no exact figure
 _RANGE_SAMPLES = 64

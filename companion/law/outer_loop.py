@@ -75,19 +75,25 @@ def bounded(vector: Vector, most: float = AUTHORITY) -> Vector:
 class LowPass:
     """A second-order low-pass of a vector: two equal poles at `frequency` Hz, exact for values that hold for a tick."""
 
-    def __init__(self, frequency: float) -> None:
+    def __init__(self, frequency: float, start: Vector | None = None) -> None:
         self._rate = 2.0 * math.pi * frequency
-        self._first: Vector | None = None
-        self._second = ZERO
+        self._first = start
+        self._second = start or ZERO
 
     def step(self, value: Vector, dt: float) -> Vector:
-        """The filtered vector `dt` s later; it begins with the first value."""
+        """The filtered vector `dt` s later; it begins at `start`, without one with the first value."""
         if self._first is None:
             self._first = self._second = value
         share = 1.0 - math.exp(-self._rate * min(LONGEST_STEP, max(0.0, dt)))
         self._first = first = mixed(self._first, value, share)
         self._second = mixed(self._second, first, share)
         return self._second
+
+    @property
+    def slope(self) -> Vector:
+        """How fast the filtered vector changes, per s."""
+        (a, b, c), (x, y, z), rate = self._first or self._second, self._second, self._rate
+        return rate * (a - x), rate * (b - y), rate * (c - z)
 
 
 def mixed(one: Vector, other: Vector, share: float) -> Vector:
@@ -98,12 +104,13 @@ def mixed(one: Vector, other: Vector, share: float) -> Vector:
 
 
 class ActingThrust:
-    """The specific thrust that acts now (m/s², along the body's z axis), by what was commanded and the vehicle file's
-    delay and lag."""
+    """The specific thrust that acts now (m/s², along the body's z axis), by what was commanded, its delay and its lag:
+    those of the vehicle file, until others are known."""
 
     def __init__(self, law: ControlLaw) -> None:
         vehicle = law.vehicle
-        self._mass, self._delay, self._lag = vehicle.mass, vehicle.command_delay, vehicle.motor_time_constant
+        self._mass = vehicle.mass
+        self.delay, self.lag = vehicle.command_delay, vehicle.motor_time_constant
         self._waiting: deque[tuple[float, float]] = deque()
         self._due = self._acting = vehicle.weight
         self._clock = 0.0
@@ -112,9 +119,9 @@ class ActingThrust:
         """Its value `dt` s later."""
         dt = min(LONGEST_STEP, max(0.0, dt))
         self._clock += dt
-        while self._waiting and self._waiting[0][0] <= self._clock - self._delay + 1e-9:
+        while self._waiting and self._waiting[0][0] <= self._clock - self.delay + 1e-9:
             self._due = self._waiting.popleft()[1]
-        share = 1.0 - math.exp(-dt / self._lag) if self._lag > 0.0 else 1.0
+        share = 1.0 - math.exp(-dt / self.lag) if self.lag > 0.0 else 1.0
         self._acting += share * (self._due - self._acting)
         return self._acting / self._mass
 

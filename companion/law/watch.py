@@ -59,11 +59,13 @@ class GuardLimits:
 
 
 class Look(NamedTuple):
-    """What a model says: `raw` as it returned it, `wanted` what of it may act (m/s²), `rate` of x and y (m/s³)."""
+    """What a model says: `raw` as it returned it, `wanted` what of it may act (m/s²), `rate` of x and y (m/s³), and
+    `now`, what it says of this moment (m/s²)."""
 
     raw: Vector
     wanted: Vector
     rate: tuple[float, float]
+    now: Vector
 
 
 class Watch:
@@ -115,14 +117,14 @@ class Watch:
         return self._judged((features,), dt)[0]
 
     def look(self, rows: Sequence[Sequence[float]], ahead: float, dt: float) -> Look:
-        """What the model says for three rows of features: where tilt acts, `ahead` s later, where thrust acts.
+        """What the model says for four rows of features: where tilt acts, `ahead` s later, where thrust acts, now.
 
-        x and y are taken from the first row, z from the third, the rate from the first two. The three count as
+        x and y are taken from the first row, z from the third, the rate from the first two. The four count as
         one inference.
         """
-        (raw, now), (_, later), (lifting, lifted) = self._judged(rows, dt)
+        (raw, now), (_, later), (lifting, lifted), (_, present) = self._judged(rows, dt)
         rate = ((later[0] - now[0]) / ahead, (later[1] - now[1]) / ahead)
-        return Look((raw[0], raw[1], lifting[2]), (now[0], now[1], lifted[2]), rate)
+        return Look((raw[0], raw[1], lifting[2]), (now[0], now[1], lifted[2]), rate, present)
 
     def _judged(self, rows: Sequence[Sequence[float]], dt: float) -> list[tuple[Vector, Vector]]:
         """Raw answer and what of it may act for each row; where anything is wrong with one, nothing of all."""

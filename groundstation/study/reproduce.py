@@ -112,13 +112,15 @@ class Flown:
 
 @dataclass(frozen=True)
 class Arm:
-    """One way to fly: a controller of the companion, with one of the models or none, and its trim."""
+    """One way to fly: a controller of the companion, with one of the models or none, its trim and its
+    observer."""
 
     name: str
     controller: str
     model: str = ""
     look_ahead: bool = True
     trim: float | None = None
+    observer: float | None = None
 
 
 ARMS = (
@@ -130,9 +132,10 @@ ARMS = (
 )
 """The columns of the table."""
 ANATOMY = (
-    Arm("at once, no trim", CORRECTED, BOTH, look_ahead=False, trim=0.0),
-    Arm("+ look-ahead", CORRECTED, BOTH, trim=0.0),
-    Arm("+ trim", CORRECTED, BOTH),
+    Arm("at once, no trim", CORRECTED, BOTH, look_ahead=False, trim=0.0, observer=0.0),
+    Arm("+ look-ahead", CORRECTED, BOTH, trim=0.0, observer=0.0),
+    Arm("+ trim", CORRECTED, BOTH, observer=0.0),
+    Arm("+ observer", CORRECTED, BOTH),
 )
 """What each part of the corrected controller is worth, with effects and network."""
 PAPER: dict[str, dict[str, tuple[float, float, float]]] = {
@@ -335,7 +338,18 @@ def table_of(prepared: Prepared, truth: Sequence[str], tasks: Sequence[tuple[Sce
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(
-        ["name", "trajectory", "set", "hidden", "charge", "battery_age", "controller", "model", "trim"]
+        [
+            "name",
+            "trajectory",
+            "set",
+            "hidden",
+            "charge",
+            "battery_age",
+            "controller",
+            "model",
+            "trim",
+            "observer",
+        ]
     )
     for scenario, arm in tasks:
         settings = (f"{key}={value:g}" for key, value in scenario.settings(prepared.seed).items())
@@ -351,7 +365,8 @@ def table_of(prepared: Prepared, truth: Sequence[str], tasks: Sequence[tuple[Sce
                 next((value for option, value in told if option == name), "")
                 for name in ("--charge", "--battery-age")
             ]
-            + [arm.controller, model, "" if arm.trim is None else arm.trim]
+            + [arm.controller, model]
+            + ["" if value is None else value for value in (arm.trim, arm.observer)]
         )
     return out.getvalue()
 

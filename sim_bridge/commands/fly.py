@@ -53,6 +53,7 @@ def fly(
     settings = settings_of(owner, wanted, draw)
     believed = load_vehicle(settings.vehicle)
     from trueflight.companion.law.controllers import TrimLimits
+    from trueflight.companion.law.residual import ObserverLimits
     from trueflight.sim_bridge.in_process import record
     from trueflight.sim_bridge.plan import Plan, bytes_of, design_of, trajectory_of
     from trueflight.sim_bridge.seal import hidden_text, seal_where_asked
@@ -72,6 +73,7 @@ def fly(
         flying.controller,
         flying.settle,
         TrimLimits() if flying.trim is None else TrimLimits(bandwidth=flying.trim),
+        ObserverLimits() if flying.observer is None else ObserverLimits(flying.observer),
         rotor_speeds,
     )
     csv_file = output.with_suffix(".csv") if table else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -99,7 +100,8 @@ def _usual(settings: Settings, trajectory: str, flying: Flying, strength: float,
         model=str(flying.model or ""), settle=flying.settle, repeat=flying.repeat, rate=flying.rate,
         rotor_speeds=rotor_speeds,
     )  # fmt: skip
-    return row if flying.trim is None else Row(**{**row.__dict__, "trim": flying.trim})
+    own: dict[str, Any] = {"trim": flying.trim, "observer": flying.observer}
+    return replace(row, **{name: value for name, value in own.items() if value is not None})
 
 
 def _report(one: Variation, flown: Flown, folder: Path, tell_hidden: bool) -> dict[str, Any]:

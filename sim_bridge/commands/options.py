@@ -156,6 +156,10 @@ class Flying:
         float | None,
         typer.Option(help="Bandwidth of the slow trim of `corrected`, rad/s; 0: none.", min=0, max=1),
     ] = None
+    observer: Annotated[
+        float | None,
+        typer.Option(help="Low-pass of the disturbance observer of `corrected`, Hz; 0: none.", min=0, max=20),
+    ] = None
     settle: Annotated[
         float, typer.Option(help="s to hold the start before the trajectory begins.", min=0, max=60)
     ] = 0.0

@@ -15,6 +15,7 @@ from trueflight.sim_bridge.many.behaviours import Behaviours
 from trueflight.sim_bridge.many.cascade import Cascades, States, Steps, euler, to_heading
 from trueflight.sim_bridge.many.courses import Courses, References
 from trueflight.sim_bridge.many.guards import Guards
+from trueflight.sim_bridge.many.observers import Observers
 from trueflight.sim_bridge.plan import Plan
 
 Heading = tuple[np.ndarray, np.ndarray]
@@ -22,7 +23,8 @@ Heading = tuple[np.ndarray, np.ndarray]
 
 
 class ManyCorrected:
-    """The cascade with the learned correction, the inverse of the actuation, and the trim, from the first tick on."""
+    """The cascade with the learned correction, the inverse of the actuation, the disturbance observer and the trim,
+    from the first tick on."""
 
     def __init__(self, laws: Sequence[ControlLaw], plans: Sequence[Plan], period: float) -> None:
         count = len(plans)
@@ -42,6 +44,7 @@ class ManyCorrected:
         self._at_limit = np.zeros(count, dtype=bool)
         self._command = np.zeros((3, count))
         self._rates, self._inverses = RateModels(count, period), LagInverses(count)
+        self._observers = Observers(laws, plans)
 
     def start(self, which: np.ndarray) -> None:
         """Some (N,) expect the linear behaviour from the next tick's state on."""
@@ -62,6 +65,7 @@ class ManyCorrected:
         actuation = guards.actuation
         self._rates.advance(self._command[:2], actuation[1], actuation[2], dt)
         share = self._faded(dt)
+        acceleration, acting = self._observers.look(states, actuation, dt)
         trim = self._trimmed(states, zeta, heading, reference, dt)
         rate_delay, rate_lag, thrust_delay, thrust_lag = share * actuation[[0, 1, 3, 4]]
 
@@ -73,8 +77,6 @@ class ManyCorrected:
         tilted[:2] += _euler_rates(zeta, np.concatenate((turned, np.zeros((1, len(share))))))[:2]
 
         ahead, lift = np.maximum(rate_lag, AHEAD), thrust_delay + thrust_lag
-        acceleration = _world(states.quaternion, states.specific_force)
-        acceleration[2] -= GRAVITY
         early, late, lifted = (
             self._ahead(states, acceleration, h) for h in (rate_delay, rate_delay + ahead, lift)
         )
@@ -85,17 +87,23 @@ class ManyCorrected:
         tilt_late = law.feedback(late[0], late[1], heading, later)
         thrust = law.feedback(lifted[0], lifted[1], heading, above)[2]
 
-        asked = law.within(thrust - law.mass * (guards.applied[2] + trim[2]))
+        before = guards.applied[2] + trim[2] + share * self._observers.pushed[2]
+        asked = law.within(thrust - law.mass * before)
         soon = tilted[:2] + ahead * rates[:2]
         voltage = np.where(states.battery_voltage > 0.0, states.battery_voltage, self._nominal)
+        here = states.position, states.velocity, states.height
         rows = np.array(
             [
                 _features(early, tilted[:2], heading, asked, voltage, guards.wants_yaw),
                 _features(late, soon, heading, asked, voltage, guards.wants_yaw),
                 _features(lifted, zeta[:2] + lift * rates[:2], heading, asked, voltage, guards.wants_yaw),
+                _features(here, zeta[:2], heading, acting, voltage, guards.wants_yaw),
             ]
         )
-        applied, slope, raw = guards.step(rows, ahead, dt, states.height)
+        applied, slope, raw, now = guards.step(rows, ahead, dt, states.height)
+        pushed, pushing = self._observers.step(zeta, heading, now, dt)
+        trim = trim + share * pushed
+        slope = slope + pushing
         total = applied + trim
         led = total[:2] + share * slope / self._tilt_gain
         lifted_thrust = law.within(thrust - law.mass * total[2])
@@ -107,6 +115,7 @@ class ManyCorrected:
         added = self._inverses.step((next_rates[:2] - wanted[:2]) / ahead, rate_lag, actuation[2], dt)
         wanted[:2] += added
         self._command = command = law.turning(zeta, wanted)
+        self._observers.commanded(attitude[2])
         return Steps(plain[2], plain_rates, total, raw, command, law.normalised(attitude[2]), trim)
 
     def _ahead(self, states: States, acceleration: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -151,14 +160,6 @@ def _features(
     (cr, cp), (sr, sp) = np.cos(tilt), np.sin(tilt)
     u, v, w = to_heading(*heading, velocity)
     return np.array([height, cr, sr, cp, sp, u, v, w, voltage, thrust, *(heading if wants_yaw else ())])
-
-
-def _world(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Vectors (3, N) in body axes turned into the world."""
-    w, x, y, z = quaternion
-    vx, vy, vz = vector
-    a, b, c = y * vz - z * vy + w * vx, z * vx - x * vz + w * vy, x * vy - y * vx + w * vz
-    return np.array([vx + 2.0 * (y * c - z * b), vy + 2.0 * (z * a - x * c), vz + 2.0 * (x * b - y * a)])
 
 
 def _euler_rates(zeta: np.ndarray, body: np.ndarray) -> np.ndarray:

@@ -82,15 +82,16 @@ class Guards:
 
     def step(
         self, rows: np.ndarray, ahead: np.ndarray, dt: float, height: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Corrections applied (3, N), their rates (2, N) and what models returned (3, N).
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Corrections applied (3, N), their rates (2, N), what models returned (3, N), and what those that act say of
+        now (3, N).
 
-        `rows` (3, F, N) are the features when tilt acts, `ahead` (N,) s later, and when thrust acts; `height` (N,) is
-        in m above the ground.
+        `rows` (4, F, N) are the features when tilt acts, `ahead` (N,) s later, when thrust acts, and now; `height` (N,)
+        is in m above the ground.
         """
         dt = min(LONGEST_STEP, dt)
         self._weight = np.where(self._live, np.minimum(1.0, self._weight + dt / self.limits.fade), 0.0)
-        raws = np.zeros((3, 3, len(self._live)))
+        raws = np.zeros((len(rows), 3, len(self._live)))
         for group, where in self._groups:
             here = where[self._live[where]]
             if len(here):
@@ -101,7 +102,8 @@ class Guards:
         trust = shares.min(axis=1)
         raws = self._judged(raws, shares, trust.min(axis=0), dt)
         weight = self._weight
-        wanted = trust[:, None] * np.clip(raws, -self._authority, self._authority) * weight
+        said = trust[:, None] * np.clip(raws, -self._authority, self._authority)
+        wanted = said * weight
         most = self.limits.authority[2] * height / self.limits.ground
         lift = np.minimum(wanted[2, 2], np.where(most > 0.0, most, 0.0))
         step = self._slew * dt
@@ -109,10 +111,11 @@ class Guards:
         self.applied = np.clip(asked, self.applied - step, self.applied + step)
         rate = (wanted[1, :2] - wanted[0, :2]) / ahead
         slew = self._slew[:2]
-        return self.applied, np.clip(rate, -slew, slew), np.array([raws[0, 0], raws[0, 1], raws[2, 2]])
+        raw = np.array([raws[0, 0], raws[0, 1], raws[2, 2]])
+        return self.applied, np.clip(rate, -slew, slew), raw, said[3] * (weight > 0.0)
 
     def _shares(self, rows: np.ndarray) -> np.ndarray:
-        """How far each feature (3, F, N) may be believed: 1 in the training range, 0 a margin beyond it."""
+        """How far each feature (4, F, N) may be believed: 1 in the training range, 0 a margin beyond it."""
         inside = rows[:, : len(self._low)]
         beyond = np.maximum(self._low - inside, inside - self._high)
         beyond = np.where(np.isnan(inside), np.inf, np.maximum(beyond, 0.0))
@@ -157,7 +160,7 @@ class _Group:
         self._session = None if session.get_inputs()[0].shape[0] == 1 else session
 
     def answers(self, rows: np.ndarray) -> np.ndarray:
-        """Accelerations (3, 3, n) for features (3, F, n): of each moment, x, y and z of the heading frame."""
+        """Accelerations (4, 3, n) for features (4, F, n): of each moment, x, y and z of the heading frame."""
         moments, _, count = rows.shape
         flat = rows[:, : self._width].transpose(2, 0, 1).reshape(-1, self._width)
         if self._session is None or count <= ALONE:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from trueflight.companion.law.controllers import TrimLimits
+from trueflight.companion.law.residual import ObserverLimits
 from trueflight.models.design import Design, load_design
 from trueflight.models.errors import InputError, shown
 from trueflight.models.outside import read_text
@@ -45,6 +46,7 @@ class Row:
     controller: str = ""
     model: str = ""
     trim: float = TrimLimits().bandwidth
+    observer: float = ObserverLimits().frequency
     settle: float = 0.0
     repeat: int = 1
     rate: float = 100.0
@@ -132,7 +134,8 @@ def _plan(
     )  # fmt: skip
     check_limits(settings)
     for value, low, high, option in (
-        (row.strength, 0.0, 1e3, "strength"), (row.trim, 0.0, 1.0, "trim"), (row.settle, 0.0, 60.0, "settle"),
+        (row.strength, 0.0, 1e3, "strength"), (row.trim, 0.0, 1.0, "trim"), (row.observer, 0.0, 20.0, "observer"),
+        (row.settle, 0.0, 60.0, "settle"),
         (row.repeat, 1, 10_000, "repeat"),
     ):  # fmt: skip
         if not low <= value <= high:
@@ -152,6 +155,7 @@ def _plan(
         row.controller,
         row.settle,
         TrimLimits(bandwidth=row.trim),
+        ObserverLimits(row.observer),
         row.rotor_speeds,
     )
     _ = plan.steps_per_tick  # a rate that cannot be flown is told before anything is written

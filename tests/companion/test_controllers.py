@@ -18,6 +18,7 @@ from trueflight.companion.law.behaviour import LinearBehaviour
 from trueflight.companion.law.control import ZERO, ControlLaw, State, euler
 from trueflight.companion.law.controllers import Corrected, Lqr, LqrIntegral, TrimLimits, make_controller
 from trueflight.companion.law.guard import Correction
+from trueflight.companion.law.residual import ObserverLimits
 from trueflight.groundstation.design.linear_response import Reference, expected_behaviour
 from trueflight.groundstation.identify.actuation import respond
 from trueflight.models import frames
@@ -32,6 +33,7 @@ VEHICLE = load_vehicle(QUAD5 / "vehicle.toml")
 DESIGN = load_design(QUAD5 / "design.json")
 LAW = ControlLaw(VEHICLE, DESIGN)
 DT = 0.01
+NO_OBSERVER = ObserverLimits(frequency=0.0)
 PX4 = Actuation(0.03, 0.045, 1.5, 0.01, 0.03)
 
 numbers = st.floats(-2.0, 2.0)
@@ -48,10 +50,10 @@ class Oracle:
         self.applied = ZERO
 
     def step(self, rows: Sequence[list[float]], ahead: float, dt: float, height: float) -> Correction:
-        now, later, lifted = (self.delta(row) for row in rows)
+        now, later, lifted, present = (self.delta(row) for row in rows)
         self.applied = (now[0], now[1], lifted[2])
         return Correction(
-            self.applied, ((later[0] - now[0]) / ahead, (later[1] - now[1]) / ahead), self.applied
+            self.applied, ((later[0] - now[0]) / ahead, (later[1] - now[1]) / ahead), self.applied, present
         )
 
 
@@ -151,7 +153,9 @@ def test_with_nothing_engaged_the_corrected_controller_is_the_cascade(
     q = tuple(float(x) for x in frames.quaternion_from_euler(np.array([roll, pitch, yaw])))
     here = State(position, velocity, q, position[2], 16.0, (0.3, -0.2, 0.1), (0.1, 0.2, 9.0))
     still = ReferenceSample((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0)
-    controller = Corrected(LAW, Oracle(drag_and_weak_thrust, PX4, engaged=0.0), TrimLimits())
+    controller = Corrected(
+        LAW, Oracle(drag_and_weak_thrust, PX4, engaged=0.0), TrimLimits(), ObserverLimits()
+    )
     for _ in range(3):
         step = controller.step(here, lambda ahead: still, DT)
         assert step.command == Lqr(LAW).step(here, lambda ahead: still, DT).command
@@ -160,7 +164,7 @@ def test_with_nothing_engaged_the_corrected_controller_is_the_cascade(
 
 def test_a_known_error_is_cancelled_and_the_flight_is_the_linear_one() -> None:
     plain = mse(flown(Lqr(LAW), Linear(delta=drag_and_weak_thrust), LIVELY))
-    corrected = Corrected(LAW, Oracle(drag_and_weak_thrust), TrimLimits(bandwidth=0.0))
+    corrected = Corrected(LAW, Oracle(drag_and_weak_thrust), TrimLimits(bandwidth=0.0), ObserverLimits())
     assert np.all(mse(flown(corrected, Linear(delta=drag_and_weak_thrust), LIVELY)) < plain / 200)
 
 
@@ -168,7 +172,7 @@ def test_looking_ahead_over_delay_and_lag_brings_the_linear_behaviour_back() -> 
     def error(known: Actuation) -> np.ndarray:
         oracle = Oracle(drag_and_weak_thrust, known)
         vehicle = Linear(PX4, drag_and_weak_thrust)
-        return mse(flown(Corrected(LAW, oracle, TrimLimits(bandwidth=0.0)), vehicle, LIVELY))
+        return mse(flown(Corrected(LAW, oracle, TrimLimits(bandwidth=0.0), NO_OBSERVER), vehicle, LIVELY))
 
     unknown, exact = error(ACTS_AT_ONCE), error(PX4)
     assert np.all(exact[:2] < unknown[:2] / 5)
@@ -183,12 +187,14 @@ def test_looking_ahead_over_delay_and_lag_brings_the_linear_behaviour_back() -> 
 def test_the_trim_removes_what_no_model_knows_and_stays_within_its_authority() -> None:
     wind = lambda features: (0.4, -0.3, -0.5)  # noqa: E731
     hover = trajectory("hover", height=1.5, duration=25.0)
-    without = flown(Corrected(LAW, Oracle(), TrimLimits(bandwidth=0.0)), Linear(delta=wind), hover)
-    trimmed = flown(Corrected(LAW, Oracle(), TrimLimits()), Linear(delta=wind), hover)
+    without = flown(
+        Corrected(LAW, Oracle(), TrimLimits(bandwidth=0.0), NO_OBSERVER), Linear(delta=wind), hover
+    )
+    trimmed = flown(Corrected(LAW, Oracle(), TrimLimits(), NO_OBSERVER), Linear(delta=wind), hover)
     assert np.all(np.abs(without[-1]) > 0.05)
     assert np.all(np.abs(trimmed[-1]) < 0.1 * np.abs(without[-1]))
 
-    storm = Corrected(LAW, Oracle(), TrimLimits(authority=0.2))
+    storm = Corrected(LAW, Oracle(), TrimLimits(authority=0.2), NO_OBSERVER)
     vehicle, still = Linear(delta=wind), ReferenceSample((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0)
     storm.start()
     for _ in range(3000):
@@ -198,7 +204,7 @@ def test_the_trim_removes_what_no_model_knows_and_stays_within_its_authority() -
 
 
 def test_the_trim_turns_with_the_vehicle_for_what_stands_still_in_the_world() -> None:
-    controller = Corrected(LAW, Oracle(), TrimLimits())
+    controller = Corrected(LAW, Oracle(), TrimLimits(), NO_OBSERVER)
     behind = ReferenceSample((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0)
 
     def at(x: float, yaw: float) -> State:
@@ -217,7 +223,7 @@ def test_the_trim_turns_with_the_vehicle_for_what_stands_still_in_the_world() ->
 def test_the_trim_does_not_grow_where_the_limits_leave_no_more() -> None:
     """What is missing there is not the correction."""
     controller, still = (
-        Corrected(LAW, Oracle(), TrimLimits()),
+        Corrected(LAW, Oracle(), TrimLimits(), NO_OBSERVER),
         ReferenceSample((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0),
     )
 
@@ -328,7 +334,7 @@ def test_a_ground_effect_that_is_expected_too_strong_does_not_pull_the_vehicle_d
     cushion = lambda gain: lambda features: (0.0, 0.0, gain * 8.0 * math.exp(-features[0] / 0.06))  # noqa: E731
     low = trajectory("lemniscate", height=0.15)
     vehicle = Linear(delta=cushion(1.0))
-    error = flown(Corrected(LAW, Oracle(cushion(2.0)), TrimLimits()), vehicle, low)
+    error = flown(Corrected(LAW, Oracle(cushion(2.0)), TrimLimits(), ObserverLimits()), vehicle, low)
     assert np.abs(error[:, 2]).max() < 0.05
 
 
@@ -338,7 +344,7 @@ def replace_position(state: State, position: tuple[float, float, float]) -> Stat
 
 def test_what_the_trim_has_learned_stays_when_the_mission_is_over_and_grows_no_more() -> None:
     controller, still = (
-        Corrected(LAW, Oracle(), TrimLimits()),
+        Corrected(LAW, Oracle(), TrimLimits(), NO_OBSERVER),
         ReferenceSample((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0),
     )
     home = State((0.0, 0.0, 1.0), ZERO, (1.0, 0.0, 0.0, 0.0), 1.0, 16.0)
@@ -375,7 +381,9 @@ def test_euler_rates_of_the_state_are_used() -> None:
     q = tuple(float(x) for x in frames.quaternion_from_euler(np.array([-0.1, 0.0, 0.0])))
     rates = []
     for p in (0.0, 0.5):
-        controller = Corrected(LAW, Oracle(actuation=Actuation(rate_lag=0.05)), TrimLimits(bandwidth=0.0))
+        controller = Corrected(
+            LAW, Oracle(actuation=Actuation(rate_lag=0.05)), TrimLimits(bandwidth=0.0), NO_OBSERVER
+        )
         here = State((0.0, 0.0, 1.0), ZERO, q, 1.0, 16.0, (p, 0.0, 0.0), (0.0, 0.0, GRAVITY))
         for _ in range(150):
             step = controller.step(here, lambda ahead: still, DT)

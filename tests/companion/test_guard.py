@@ -38,7 +38,7 @@ def guard_of(model, limits=LIMITS, trips=None, clock=None) -> Guard:
 
 def step(guard: Guard, features, dt: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """One tick with the same features at each of the moments that the controller asks for."""
-    correction = guard.step([features] * 3, 0.02, dt)
+    correction = guard.step([features] * 4, 0.02, dt)
     return correction.applied, correction.raw
 
 
@@ -175,7 +175,7 @@ def test_nonsense_trips_at_once_and_for_good(model, reason: str) -> None:
 
     def counted(features):
         calls.append(1)
-        return (1.0, 0.0, 0.0) if len(calls) <= 99 * 3 else model(features)  # three moments a tick
+        return (1.0, 0.0, 0.0) if len(calls) <= 99 * 4 else model(features)  # four moments a tick
 
     guard = guard_of(counted, trips=trips)
     guard.start()
@@ -191,7 +191,7 @@ def test_nonsense_trips_at_once_and_for_good(model, reason: str) -> None:
     guard.stop()
     assert run(guard, 0.5)[-1] == (0.0, 0.0, 0.0)
     assert guard.tripped
-    assert 99 * 3 < len(calls) <= 100 * 3, "a tripped model is not called again"
+    assert 99 * 4 < len(calls) <= 100 * 4, "a tripped model is not called again"
 
 
 def test_a_late_model_trips_after_some_misses_and_a_very_late_one_at_once() -> None:
@@ -199,7 +199,7 @@ def test_a_late_model_trips_after_some_misses_and_a_very_late_one_at_once() -> N
     delay = [0.0]
 
     def model(features):
-        clock.now += delay[0] / 3.0  # three moments a tick
+        clock.now += delay[0] / 4.0  # four moments a tick
         return (0.1, 0.0, 0.0)
 
     guard = guard_of(model, clock=clock)
@@ -271,7 +271,7 @@ def test_near_the_ground_a_model_may_add_thrust_but_take_little_away() -> None:
         guard.start()
         row = [height, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 16.0, 7.0]
         for _ in range(200):
-            correction = guard.step([row, row, row], 0.02, 0.01, height)
+            correction = guard.step([row] * 4, 0.02, 0.01, height)
         return correction.applied[2]
 
     limits = GuardLimits()
@@ -285,7 +285,7 @@ def test_without_limits_of_its_own_a_guard_fades_in_a_second_and_a_model_has_2_m
     clock, takes = Clock(), [0.0]
 
     def model(features):
-        clock.now += takes[0] / 3.0  # three moments a tick
+        clock.now += takes[0] / 4.0  # four moments a tick
         return (0.1, 0.0, 1.0)
 
     def begun() -> Guard:
@@ -298,7 +298,7 @@ def test_without_limits_of_its_own_a_guard_fades_in_a_second_and_a_model_has_2_m
     assert guard.status == "fading_in"
     run(guard, 0.02)
     assert guard.status == "active"
-    lifts = [guard.step([INSIDE] * 3, 0.02, 0.1, height).applied[2] for height in (0.0, 0.1, 0.5)]
+    lifts = [guard.step([INSIDE] * 4, 0.02, 0.1, height).applied[2] for height in (0.0, 0.1, 0.5)]
     assert lifts == pytest.approx([0.0, 0.2 * 4.0, 1.0]), "0.5 m above the ground all of it acts"
     for takes[0], ticks in ((0.0019, 100), (0.0021, 4), (0.0, 1), (0.049, 1)):
         for _ in range(ticks):
@@ -340,7 +340,12 @@ def test_a_guard_without_a_model_changes_nothing() -> None:
     assert (guard.limits, guard.status, guard.live, guard.last_good) == (LIMITS, "off", "", "")
     assert (guard.engaged, guard.actuation, guard.settled, guard.tripped) == (0.0, ACTS_AT_ONCE, True, False)
     assert (guard.wants_yaw, guard.inference_time, guard.why_tripped("a")) == (False, 0.0, "")
-    assert guard.step([INSIDE] * 3, 0.02, DT) == ((0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0, 0.0))
+    assert guard.step([INSIDE] * 4, 0.02, DT) == (
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+    )
     assert Guard(None).limits == GuardLimits()
 
 
@@ -351,7 +356,7 @@ def test_a_model_is_asked_from_the_first_tick_on_in_which_it_may_act_and_in_no_o
     assert asked == []
     guard.start()
     step(guard, INSIDE, 0.0)  # the fade begins: nothing of it acts, but it shows what it would say
-    assert len(asked) == 3
+    assert len(asked) == 4
     run(guard, 0.1)
     guard.stop()
     run(guard, 0.2)
@@ -364,7 +369,7 @@ def test_a_model_is_asked_from_the_first_tick_on_in_which_it_may_act_and_in_no_o
 def test_the_rate_told_is_how_fast_the_applied_correction_is_about_to_change() -> None:
     slopes = [4.0, -8.0]
     guard = guard_of(lambda features: (slopes[0] * features[1], slopes[1] * features[1], 0.0))
-    moving = [(1.0, 0.25), (1.0, 0.375), (1.0, 0.25)]
+    moving = [(1.0, 0.25), (1.0, 0.375), (1.0, 0.25), INSIDE]
     assert guard.step(moving, 0.125, DT).rate == (0.0, 0.0)
     guard.start()
     share = 0.0
@@ -372,7 +377,7 @@ def test_the_rate_told_is_how_fast_the_applied_correction_is_about_to_change() -
         share = min(1.0, share + DT / LIMITS.fade)
         assert guard.step(moving, 0.125, DT).rate == pytest.approx((4.0 * share, -8.0 * share))
     for slopes[0], slopes[1] in ((-12.0, 12.0), (12.0, -12.0)):  # a change of 3 m/s² in an eighth of a second
-        rate = guard.step([(1.0, -0.125), (1.0, 0.125), INSIDE], 0.0625, DT).rate
+        rate = guard.step([(1.0, -0.125), (1.0, 0.125), INSIDE, INSIDE], 0.0625, DT).rate
         assert rate == (math.copysign(30.0, slopes[0]), math.copysign(30.0, slopes[1])), "cut at the slew"
 
 
@@ -405,7 +410,7 @@ def test_at_no_height_or_an_unknown_one_no_model_takes_thrust_away(height: float
     guard = guard_of(constant(0.0, 0.0, 2.0))
     guard.start()
     for _ in range(100):
-        assert guard.step([INSIDE] * 3, 0.02, DT, height).applied == (0.0, 0.0, 0.0)
+        assert guard.step([INSIDE] * 4, 0.02, DT, height).applied == (0.0, 0.0, 0.0)
     for _ in range(100):
-        high = guard.step([INSIDE] * 3, 0.02, DT).applied  # how high is not told: high enough
+        high = guard.step([INSIDE] * 4, 0.02, DT).applied  # how high is not told: high enough
     assert high == (0.0, 0.0, 2.0)

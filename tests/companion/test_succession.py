@@ -44,7 +44,7 @@ def flying(model, trips: list | None = None) -> Guard:
 
 
 def run(guard: Guard, seconds: float, features=INSIDE) -> np.ndarray:
-    return np.array([guard.step([features] * 3, AHEAD, DT).applied for _ in range(round(seconds / DT))])
+    return np.array([guard.step([features] * 4, AHEAD, DT).applied for _ in range(round(seconds / DT))])
 
 
 def test_a_successor_fades_in_without_a_step_and_the_weights_sum_to_one() -> None:
@@ -106,7 +106,7 @@ def test_whatever_is_swapped_and_when_the_envelope_holds_and_a_tripped_model_sta
             getattr(guard, order)()
         calls.clear()
         out = set(tripped)
-        correction = guard.step([features] * 3, AHEAD, dt)
+        correction = guard.step([features] * 4, AHEAD, dt)
         applied = np.array(correction.applied)
         assert np.all(np.isfinite(applied))
         assert np.all(np.abs(applied) <= LIMITS.authority)
@@ -128,7 +128,7 @@ def test_between_equal_models_the_output_does_not_change(numbers, track, swaps) 
     for i, features in enumerate(track):
         if i in swaps:
             swapped.succeed(watch(model_of(numbers), f"b{i}"))
-        one, other = (guard.step([features] * 3, AHEAD, DT) for guard in (alone, swapped))
+        one, other = (guard.step([features] * 4, AHEAD, DT) for guard in (alone, swapped))
         np.testing.assert_allclose(other.applied, one.applied, atol=1e-9)
         np.testing.assert_allclose(other.rate, one.rate, atol=1e-6)
 
@@ -282,13 +282,13 @@ def test_while_they_change_both_are_asked_the_live_one_s_answer_is_recorded_and_
     None
 ):
     guard = half_over(one((0.5, 0.0, 0.0), "a", 1e-4), one((1.0, 0.0, 0.0), "b", 2e-4))
-    correction = guard.step([INSIDE] * 3, AHEAD, 0.0)
+    correction = guard.step([INSIDE] * 4, AHEAD, 0.0)
     assert correction.raw == (1.0, 0.0, 0.0)
     assert correction.applied[0] == pytest.approx(0.75)
-    assert guard.inference_time == pytest.approx(3 * 1e-4 + 3 * 2e-4)
+    assert guard.inference_time == pytest.approx(4 * 1e-4 + 4 * 2e-4)
     assert (guard.engaged, guard.settled) == (pytest.approx(1.0), False)
     run(guard, 0.3)
-    assert guard.inference_time == pytest.approx(3 * 2e-4), "only of this tick"
+    assert guard.inference_time == pytest.approx(4 * 2e-4), "only of this tick"
     assert guard.settled
 
 
@@ -298,7 +298,7 @@ def test_where_the_one_that_leaves_trips_the_other_still_acts_in_that_very_tick(
     old = watch(lambda features: (math.nan if bad[0] else 0.1, 0.0, 0.0), "a")
     guard = half_over(old, one((0.1, 0.0, 0.0), "b"), trips)
     bad[0] = True
-    assert guard.step([INSIDE] * 3, AHEAD, 0.01).applied[0] == pytest.approx(0.1 * 0.52)
+    assert guard.step([INSIDE] * 4, AHEAD, 0.01).applied[0] == pytest.approx(0.1 * 0.52)
     assert trips == [("a", "the model returned a number that is not finite")]
     assert (guard.live, guard.last_good, guard.tripped) == ("b", "", False), "nothing is left to go back to"
     guard.roll_back()
@@ -351,7 +351,7 @@ def test_however_the_ticks_fall_no_more_than_all_acts_and_nothing_known_leaves_i
         guard = Guard(model("a"))
         guard.start()
         for i in range(25):
-            guard.step([INSIDE] * 3, AHEAD, draw.choice([0.01, 0.02, 0.033, 0.1]))
+            guard.step([INSIDE] * 4, AHEAD, draw.choice([0.01, 0.02, 0.033, 0.1]))
             assert guard.engaged <= 1.0, "to the last bit, or a limit times it is beyond the limit"
             assert guard.actuation == most
             assert guard.actuation.scaled(guard.engaged) != ACTS_AT_ONCE

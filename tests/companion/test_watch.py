@@ -55,13 +55,14 @@ def test_a_watch_begins_untripped_without_trust_and_without_a_name() -> None:
 
 def test_tilt_is_corrected_for_when_it_acts_thrust_for_when_that_acts_and_the_rate_is_in_between() -> None:
     watch = watch_of(lambda features: (features[1], 3.0 * features[1] ** 2, features[0]))
-    look = watch.look([(1.0, 0.5), (1.5, 0.75), (2.0, -1.0)], 0.125, 0.01)
+    look = watch.look([(1.0, 0.5), (1.5, 0.75), (2.0, -1.0), (3.0, 1.0)], 0.125, 0.01)
     assert look.raw == look.wanted == (0.5, 0.75, 2.0)
     assert look.rate == ((0.75 - 0.5) / 0.125, (3.0 * 0.75**2 - 0.75) / 0.125)
+    assert look.now == (1.0, 3.0, 3.0)
 
 
 def test_what_a_model_says_is_cut_for_acting_and_told_whole_for_the_record() -> None:
-    look = watch_of(constant(-5.0, 5.0, -9.0)).look([INSIDE] * 3, 0.02, 0.01)
+    look = watch_of(constant(-5.0, 5.0, -9.0)).look([INSIDE] * 4, 0.02, 0.01)
     assert look.raw == (-5.0, 5.0, -9.0)
     assert look.wanted == (-2.0, 4.0, -8.0)
     assert look.rate == (0.0, 0.0)
@@ -69,9 +70,10 @@ def test_what_a_model_says_is_cut_for_acting_and_told_whole_for_the_record() -> 
 
 def test_each_moment_is_trusted_by_its_own_features_and_the_worst_of_them_is_told() -> None:
     watch = watch_of(constant(1.0, 2.0, 4.0))
-    look = watch.look([(4.25, 0.0), (1.0, 0.0), (4.5, 2.75)], 0.5, 0.01)
+    look = watch.look([(4.25, 0.0), (1.0, 0.0), (4.5, 2.75), (4.5, 0.0)], 0.5, 0.01)
     assert look.wanted == (0.75, 1.5, 1.0)
     assert look.rate == ((1.0 - 0.75) / 0.5, (2.0 - 1.5) / 0.5)
+    assert look.now == (0.5, 1.0, 2.0)
     assert watch.trust == 0.25
     assert watch.evaluate(INSIDE, 0.01) == ((1.0, 2.0, 4.0), (1.0, 2.0, 4.0))
     assert watch.trust == 1.0
@@ -213,7 +215,7 @@ def test_an_answer_in_time_is_one_within_the_deadline_and_some_late_ones_in_a_ro
     assert (raw, wanted) == ((1.0, 0.0, 0.0), ZERO)
 
 
-def test_a_single_answer_beyond_the_stall_trips_and_three_moments_are_one_inference() -> None:
+def test_a_single_answer_beyond_the_stall_trips_and_four_moments_are_one_inference() -> None:
     clock = Clock()
     clock.takes = LIMITS.stall
     at_the_stall = watch_of(constant(1.0, 0.0, 0.0), clock)
@@ -221,14 +223,14 @@ def test_a_single_answer_beyond_the_stall_trips_and_three_moments_are_one_infere
     assert not at_the_stall.tripped
     clock.takes = 0.5
     watch = watch_of(constant(1.0, 0.0, 0.0), clock)
-    watch.look([INSIDE] * 3, 0.02, 0.01)
-    assert watch.inference_time == 1.5
-    assert watch.reason == "inference took 1500.0 ms"
+    watch.look([INSIDE] * 4, 0.02, 0.01)
+    assert watch.inference_time == 2.0
+    assert watch.reason == "inference took 2000.0 ms"
 
 
 @pytest.mark.parametrize("nonsense", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("moment", range(3))
+@pytest.mark.parametrize("moment", range(4))
 def test_a_number_that_is_not_finite_anywhere_leaves_nothing_of_all(nonsense, axis: int, moment: int) -> None:
     asked = []
 
@@ -238,7 +240,7 @@ def test_a_number_that_is_not_finite_anywhere_leaves_nothing_of_all(nonsense, ax
         return tuple(nonsense if bad and i == axis else 1.0 for i in range(3))
 
     watch = watch_of(model)
-    assert watch.look([INSIDE] * 3, 0.02, 0.01) == (ZERO, ZERO, (0.0, 0.0))
+    assert watch.look([INSIDE] * 4, 0.02, 0.01) == (ZERO, ZERO, (0.0, 0.0), ZERO)
     assert watch.reason == "the model returned a number that is not finite"
     assert watch.tripped
 
@@ -254,12 +256,12 @@ def test_after_a_trip_the_model_is_not_asked_again_and_nothing_is_wanted() -> No
     watch = watch_of(model, clock)
     assert watch.evaluate(INSIDE, 0.01) == (ZERO, ZERO)
     assert watch.reason == "the model raised LookupError"
-    assert watch.look([INSIDE] * 3, 0.02, 0.01) == (ZERO, ZERO, (0.0, 0.0))
+    assert watch.look([INSIDE] * 4, 0.02, 0.01) == (ZERO, ZERO, (0.0, 0.0), ZERO)
     assert len(asked) == 1
     assert watch.inference_time == 0.0
 
 
-def test_a_model_that_takes_rows_is_asked_once_for_the_three_moments() -> None:
+def test_a_model_that_takes_rows_is_asked_once_for_the_four_moments() -> None:
     class Rows:
         asked = 0
 
@@ -272,11 +274,11 @@ def test_a_model_that_takes_rows_is_asked_once_for_the_three_moments() -> None:
 
     model = Rows()
     watch = Watch(model, (Z, VX), LIMITS)
-    assert watch.look([(1.0, 0.5), (1.0, 1.0), INSIDE], 0.25, 0.01).rate == (2.0, 0.0)
+    assert watch.look([(1.0, 0.5), (1.0, 1.0), INSIDE, INSIDE], 0.25, 0.01).rate == (2.0, 0.0)
     assert model.asked == 1
 
 
-@pytest.mark.parametrize("answers", [2, 4])
+@pytest.mark.parametrize("answers", [3, 5])
 def test_a_model_that_answers_for_more_or_fewer_moments_than_asked_trips(answers: int) -> None:
     class Miscounting:
         def __call__(self, features: Sequence[float]) -> Sequence[float]:
@@ -286,5 +288,5 @@ def test_a_model_that_answers_for_more_or_fewer_moments_than_asked_trips(answers
             return [(1.0, 0.0, 0.0)] * answers
 
     watch = Watch(Miscounting(), (Z, VX), LIMITS)
-    assert watch.look([INSIDE] * 3, 0.02, 0.01) == (ZERO, ZERO, (0.0, 0.0))
+    assert watch.look([INSIDE] * 4, 0.02, 0.01) == (ZERO, ZERO, (0.0, 0.0), ZERO)
     assert watch.reason == "the model raised ValueError"
