@@ -115,6 +115,7 @@ class World:
         # A free joint's generalised force is the force in the world and the torque in the body.
         self.wrench = _floats(self.data.qfrc_applied)
         self._mass, self._inertia = float(self.model.body_mass[1]), self.model.body_inertia[1].copy()
+        self._loaded: tuple[float, np.ndarray] = (0.0, np.zeros(3))
         mujoco.mj_forward(self.model, self.data)
 
     def step(self) -> None:
@@ -137,12 +138,16 @@ class World:
         """Whether any part of the vehicle touches the ground."""
         return bool(self.data.ncon)
 
-    def load(self, mass: float, inertia: float) -> None:
-        """Fix a payload (kg, kg m² about every axis) to the vehicle, with its centre in the centre of mass."""
-        self._weigh(self._mass + mass, self._inertia + inertia)
+    def load(self, mass: float, inertia: float | tuple[float, float, float]) -> None:
+        """Fix a further payload (kg, kg m² about every axis, or about each) to the vehicle, with its centre in the
+        centre of mass."""
+        before, moments = self._loaded
+        self._loaded = before + mass, moments + inertia
+        self._weigh(self._mass + self._loaded[0], self._inertia + self._loaded[1])
 
     def unload(self) -> None:
         """The vehicle's own mass and inertia again."""
+        self._loaded = 0.0, np.zeros(3)
         self._weigh(self._mass, self._inertia)
 
     def _weigh(self, mass: float, inertia: np.ndarray) -> None:

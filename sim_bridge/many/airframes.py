@@ -66,6 +66,7 @@ class Airframes:
         self._constants = stacked([frame.powertrain.thrust_constants for frame in frames])
         wind = stacked([frame.wind for frame in frames])
         self._wind = wind if wind.any() else None
+        self._turbulent = [(i, t) for i, frame in enumerate(frames) if (t := frame.turbulence) is not None]
         before = getattr(self, "_rotor_laws", None), getattr(self, "_body_laws", None)
         self._rotor_laws = Laws([frame.rotor_laws for frame in frames], self.motion, self.thrusts, before[0])
         self._body_laws = Laws([frame.body_laws for frame in frames], self.motion, self.thrusts, before[1])
@@ -89,6 +90,10 @@ class Airframes:
         self._rotate(position[3:], rotation)
         r = rotation.reshape(3, 3, -1)
         air = velocity[:3] if self._wind is None else velocity[:3] - self._wind
+        if self._turbulent:
+            air = air.copy()
+            for i, turbulence in self._turbulent:
+                air[:, i] -= turbulence.step()
         np.multiply(r, air[:, None], out=self._turned)
         np.add.reduce(self._turned, axis=0, out=motion[6:9])
 

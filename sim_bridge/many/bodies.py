@@ -19,8 +19,8 @@ class Load:
     def __init__(self, bodies: Bodies, index: int) -> None:
         self._bodies, self._index = bodies, index
 
-    def load(self, mass: float, inertia: float) -> None:
-        """Fix a payload (kg, kg m² about every axis) to this body."""
+    def load(self, mass: float, inertia: float | tuple[float, float, float]) -> None:
+        """Fix a further payload (kg, kg m² about every axis, or about each) to this body."""
         self._bodies.load(self._index, mass, inertia)
 
 
@@ -48,7 +48,7 @@ class Bodies:
         self._inertia = np.array([model.body_inertia[1] for model in models]).T.copy()
         self._near = np.array([reach(vehicle) for vehicle in vehicles]) + _MARGIN
         self._worlds: dict[int, World] = {}
-        self._payloads: dict[int, tuple[float, float]] = {}
+        self._payloads: dict[int, list[tuple[float, float | tuple[float, float, float]]]] = {}
         self._work3, self._turned, self._square = (
             np.empty((3, count)),
             np.empty((4, count)),
@@ -63,9 +63,9 @@ class Bodies:
         self.velocity[:, index] = 0.0
         self.touching[index] = False
 
-    def load(self, index: int, mass: float, inertia: float) -> None:
-        """Fix a payload (kg, kg m² about every axis) to one vehicle."""
-        self._payloads[index] = mass, inertia
+    def load(self, index: int, mass: float, inertia: float | tuple[float, float, float]) -> None:
+        """Fix a further payload (kg, kg m² about every axis, or about each) to one vehicle."""
+        self._payloads.setdefault(index, []).append((mass, inertia))
         self._mass[index] += mass
         self._inertia[:, index] += inertia
         self._weigh()
@@ -141,8 +141,8 @@ class Bodies:
         world = self._worlds.get(index)
         if world is None:
             world = self._worlds[index] = World(self._vehicles[index])
-            if index in self._payloads:
-                world.load(*self._payloads[index])
+            for payload in self._payloads.get(index, ()):
+                world.load(*payload)
         data = world.data
         data.qpos[:] = position
         data.qvel[:] = velocity

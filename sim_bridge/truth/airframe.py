@@ -17,6 +17,7 @@ import numpy as np
 
 from trueflight.models.vehicle import Vehicle
 from trueflight.sim_bridge.truth.battery import Battery, BatteryCell, battery_for
+from trueflight.sim_bridge.truth.turbulence import Turbulence
 
 AIR_DENSITY = 1.225
 """kg/m³ at sea level."""
@@ -127,7 +128,7 @@ class Airframe:
 
     `on_rotors` are called after the rotors' speeds are known and may change `motion.thrusts`; `on_body` are
     called last and add to `motion.wrench`; `rotor_laws` and `body_laws` tell what they are made of. `wind` is the air's
-    velocity in the world, m/s.
+    mean velocity in the world, m/s, and `turbulence` what comes beside it.
     """
 
     def __init__(self, vehicle: Vehicle, powertrain: Powertrain, dt: float) -> None:
@@ -138,6 +139,7 @@ class Airframe:
         self.battery = Battery(powertrain.battery)
         self.motion.voltage = self.battery.load(AVIONICS_POWER)
         self.wind = (0.0, 0.0, 0.0)
+        self.turbulence: Turbulence | None = None
         self.on_rotors: list[Act] = []
         self.on_body: list[Act] = []
         self.rotor_laws: list[Acting] = []
@@ -207,6 +209,9 @@ class Airframe:
         m.r20, m.r21, m.r22 = r20, r21, r22 = xz - wy, yz + wx, 1.0 - xx - yy
         wind = self.wind
         ax, ay, az = vx - wind[0], vy - wind[1], vz - wind[2]
+        if self.turbulence is not None:
+            gx, gy, gz = self.turbulence.step()
+            ax, ay, az = ax - gx, ay - gy, az - gz
         m.u = r00 * ax + r10 * ay + r20 * az
         m.v = r01 * ax + r11 * ay + r21 * az
         m.w = r02 * ax + r12 * ay + r22 * az

@@ -238,6 +238,70 @@ def test_a_drawn_size_is_in_its_range_and_a_given_one_is_taken(vehicle: Vehicle,
     assert choose([f"{name}:{middle!r}"], vehicle, 1)[0].parameters[first] == middle
 
 
+@pytest.mark.parametrize("seed", STATES)
+def test_external_force_stays_as_it_is_in_the_world(vehicle: Vehicle, seed: int) -> None:
+    force, torque, *_ = added(
+        vehicle, Hidden("external_force", {"force": 1.3, "x": 0.3, "y": -0.4, "z": 1.2}), seed
+    )
+    assert force == pytest.approx([0.3, -0.4, 1.2]) and torque == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_external_torque_turns_with_the_body(vehicle: Vehicle) -> None:
+    force, torque, *_ = added(vehicle, Hidden("external_torque", {"torque": 0.05, "x": 0.03, "y": -0.04}), 1)
+    assert torque == pytest.approx([0.03, -0.04, 0.0]) and force == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_periodic_torque_is_a_sine_of_time(vehicle: Vehicle) -> None:
+    numbers = {"amplitude": 0.05, "x": 0.03, "y": 0.04, "frequency": 1.0 / (8 * PHYSICS_STEP)}
+    airframe = airframe_with(vehicle, Hidden("periodic_torque", numbers))
+    position, velocity, commands, _ = random_state(0)
+    told = np.array([wrench_of(airframe, position, velocity, commands)[1] for _ in range(8)])
+    _, plain = wrench_of(airframe_with(vehicle), position, velocity, commands)
+    sine = np.sin(2 * np.pi * np.arange(8) / 8)
+    assert told - plain == pytest.approx(np.outer(sine, [0.03, 0.04, 0.0]), abs=1e-12)
+
+
+def test_gusts_have_their_deviation_and_are_the_same_whoever_flies(vehicle: Vehicle) -> None:
+    steps = round(200.0 / PHYSICS_STEP)  # s: five periods of the slowest
+    gusts = Hidden("gusts", {"deviation": 2.0, "draw": 7.0, "drag": 0.2})
+    one, other = (airframe_with(vehicle, gusts).turbulence for _ in range(2))
+    assert one is not None and other is not None
+    air = np.array([one.step() for _ in range(steps)])
+    assert air.std(axis=0) == pytest.approx([2.0, 2.0, 1.0], rel=0.1)
+    assert abs(air.mean(axis=0)).max() < 0.1
+    assert np.array_equal(air[:50], [other.step() for _ in range(50)])
+    speed = np.linalg.norm(np.diff(air, axis=0), axis=1) / PHYSICS_STEP
+    assert 0.5 < speed.mean() < 10.0  # m/s²: gusts, neither a calm nor noise
+
+
+def test_gusts_act_through_drag_alone(vehicle: Vehicle) -> None:
+    airframe = airframe_with(vehicle, Hidden("gusts", {"deviation": 3.0, "draw": 1.0, "drag": 0.2}))
+    assert airframe.turbulence is not None
+    hover = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    expected = np.array(airframe_with(vehicle, Hidden("gusts", {"deviation": 3.0, "draw": 1.0, "drag": 0.2}))
+                        .turbulence.step())  # fmt: skip
+    force, _ = wrench_of(airframe, hover, [0.0] * 6, [vehicle.hover_thrust] * 4)
+    assert force[:2] == pytest.approx(0.2 * vehicle.mass * expected[:2])
+
+
+def test_inertia_is_the_bodys_own_by_a_factor_and_a_payload_comes_on_top(vehicle: Vehicle) -> None:
+    hidden = (Hidden("inertia", {"factor": 1.4}), Hidden("payload", {"mass_fraction": 0.2, "time": 0.1}))
+    simulator = Simulator(vehicle, hidden, noise=NO_NOISE)
+    simulator.start_in_hover((0.0, 0.0, 1.0))
+    model = simulator.world.model
+    for _ in range(2):
+        simulator.step(vehicle.hover_thrust, 0.0, 0.0, 0.0)
+    assert model.body_inertia[1] == pytest.approx(1.4 * np.array(vehicle.inertia))
+    assert model.body_mass[1] == pytest.approx(vehicle.mass)
+    for _ in range(60):
+        simulator.step(vehicle.hover_thrust, 0.0, 0.0, 0.0)
+    cube = 0.2 * vehicle.mass * vehicle.rotor_radius**2 / 6.0
+    assert model.body_inertia[1] == pytest.approx(1.4 * np.array(vehicle.inertia) + cube)
+    assert model.body_mass[1] == pytest.approx(1.2 * vehicle.mass)
+    simulator.world.unload()
+    assert model.body_inertia[1] == pytest.approx(vehicle.inertia)
+
+
 @pytest.mark.parametrize("bad", [["windd"], ["wind:fast"], ["wind:99"], ["wind:nan"], ["none", "wind"]])
 def test_what_cannot_be_hidden_is_refused(vehicle: Vehicle, bad: list[str]) -> None:
     with pytest.raises(InputError, match="--hidden"):

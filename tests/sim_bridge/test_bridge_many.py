@@ -135,7 +135,14 @@ def test_paths_controllers_batteries_and_what_begins_in_flight(vehicle: Vehicle,
         ("ceiling_effect", "ground_effect", "gyroscopic"),
         ("vortex_ring:0.4", "rotor_drag", "battery_sag"),
         ("wind:4@1", "rotor_damage:0.1@2.004", "thrust_gain:1.1@1"),
-        ("payload:0.2", "imu_lever_arm", "estimator_delay:0.014", "rotor_drag:0.4@0.5"),
+        (
+            "payload:0.2",
+            "inertia:1.3",
+            "gusts",
+            "imu_lever_arm",
+            "estimator_delay:0.014",
+            "rotor_drag:0.4@0.5",
+        ),
     )
     plans = []
     for i, (path, words) in enumerate(zip(paths, hidden, strict=True)):

@@ -29,6 +29,11 @@ _NAMES = (
     "rotor_damage",
     "rate_loop_lag",
     "gyroscopic",
+    "external_force",
+    "external_torque",
+    "periodic_torque",
+    "gusts",
+    "inertia",
 )
 """In the order that draws go by: a seed hides for ever what it hid, so that a new effect comes last."""
 
