@@ -7,7 +7,7 @@ odometry message: the JSON that MAVSDK hands over is read (`parse`), the flight 
 written (`setpoint`); then, after it has left, the watch over the flight (`watch`) and the record's tick (`record`).
 Each stage is timed by its thread's processor time, and the median over all ticks is told in us. `before` is the sum of
 the stages that stand between odometry and setpoint. `--models` holds ONNX files by the names of `correction_models.py`
-(made there first where the folder is empty): each flies `corrected`. The last rows are the models alone: three rows of
+(made there first where the folder is empty): each flies `corrected`. The last rows are the models alone: the rows of
 features as a tick asks for, by ONNX Runtime and as the companion runs them.
 """
 
@@ -130,17 +130,19 @@ def _open(onnx: bytes, vehicle: Any) -> Any:
 
 
 def model_costs(onnx: bytes, runs: int = 3000) -> dict[str, float]:
-    """Processor time of three rows of features, us: the least of many runs, by ONNX Runtime alone and as flown."""
+    """Processor time of a tick's rows of features, us: the median of many runs, by ONNX Runtime alone and as flown."""
     import numpy as np
     import onnxruntime
 
+    from trueflight.companion.law.inference import LOOK_ROWS
+
     model = _open(onnx, load_vehicle(VEHICLE))
     middle = [0.5 * (one.low + one.high) for one in model.info.features]
-    rows = [[value + 0.01 * i for value in middle] for i in range(3)]
+    rows = [[value + 0.01 * i for value in middle] for i in range(LOOK_ROWS)]
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(onnx, options, providers=["CPUExecutionProvider"])
-    given, answer = np.array(rows, dtype=np.float32), np.zeros((3, 3), dtype=np.float32)
+    given, answer = np.array(rows, dtype=np.float32), np.zeros((LOOK_ROWS, 3), dtype=np.float32)
     binding = session.io_binding()
     binding.bind_input("features", "cpu", 0, np.float32, given.shape, given.ctypes.data)
     binding.bind_output("delta", "cpu", 0, np.float32, answer.shape, answer.ctypes.data)
@@ -198,7 +200,7 @@ def main() -> None:
         stages = "  ".join(f"{stage} {row[stage]:5.1f}" for stage in STAGES)
         line = f"{row['program']:8s} {stages}  before {row['before']:6.1f} us ({row['before'] / plain:.2f} x plain)"
         if "bare" in row:
-            line += f"  three rows: bare {row['bare']:.1f}, flown {row['flown']:.1f} us"
+            line += f"  rows of a tick: bare {row['bare']:.1f}, flown {row['flown']:.1f} us"
         print(line)
 
 

@@ -82,7 +82,7 @@ class Model:
 
 
 class Runtime:
-    """A file as ONNX Runtime computes it: three rows in one run where the file can."""
+    """A file as ONNX Runtime computes it: the four rows of a tick in one run where the file can."""
 
     def __init__(self, session: onnxruntime.InferenceSession, width: int) -> None:
         self._session, self._width = session, width

@@ -216,7 +216,7 @@ from trueflight.models.vehicle import load_vehicle
 onnx = Path({str(tmp_path / "model.onnx")!r}).read_bytes()
 store = ModelStore(Path({str(tmp_path / "models")!r}), load_vehicle({str(VEHICLE.source)!r}), 0.01)
 assert store.stage(onnx).accepted and store.commit(model_hash(onnx)) == ""
-assert store.live.watched().look([[1.0] * {WIDTH}] * 3, 0.02, 0.01)
+assert store.live.watched().look([[1.0] * {WIDTH}] * 4, 0.02, 0.01)
 assert store.live.straight and "onnxruntime" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120.0)
