@@ -36,7 +36,7 @@ class ObserverLimits:
     vehicle up there may be the ground itself.
     """
 
-    frequency: float = field(default=2.0, metadata={"zero": "switches it off"})
+    frequency: float = field(default=3.0, metadata={"zero": "switches it off"})
     authority: float = 3.0
     ground: float = 0.5
 
