@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from dataclasses import dataclass, field
@@ -355,6 +356,22 @@ def test_the_correction_is_on_when_the_mission_begins_and_off_after_it() -> None
     assert landing[-1].guard == "off"
     assert landing[-1].step is not None
     assert landing[-1].step.correction == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("name", "has"), [("lqr", False), ("lqr_integral", False), ("indi", True)])
+def test_controllers_that_measure_acceleration_get_the_accelerometer(name: str, has: bool) -> None:
+    rig = Rig()
+    rig.latest.imu = json.dumps(
+        dict.fromkeys(("time_usec", "yacc", "xgyro", "ygyro", "zgyro"), 0) | {"xacc": 1.0, "zacc": -9.8}
+    )
+    rig.take_off(Mission("m1", trajectory("hover", duration=6.0), name))
+    controller, told = rig.flight._phases.controller, []
+    assert controller is not None
+    step = controller.step
+    controller.step = lambda state, *more: told.append(state.specific_force) or step(state, *more)
+    rig.run(0.1)
+    assert told
+    assert set(told) == {(1.0, 0.0, 9.8) if has else None}
 
 
 def test_a_vehicle_on_its_back_gets_no_more_setpoints() -> None:
