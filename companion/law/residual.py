@@ -37,7 +37,7 @@ class ObserverLimits:
     """
 
     frequency: float = field(default=3.0, metadata={"zero": "switches it off"})
-    authority: float = 3.0
+    authority: float = 6.0
     ground: float = 0.5
 
 

@@ -114,7 +114,7 @@ def test_the_residual_is_what_pushes_in_the_heading_frame(zeta, push, modelled) 
     assert thrust == pytest.approx(LAW.vehicle.weight)
     expected = np.subtract(push, modelled)
     assert observer.residual == pytest.approx(tuple(expected), abs=1e-6)
-    if np.abs(turn @ expected).max() < 3.0:
+    if np.abs(turn @ expected).max() < ObserverLimits().authority:
         assert pushed == pytest.approx(tuple(expected), abs=1e-3)
 
 
@@ -150,7 +150,7 @@ def test_an_accelerometer_that_is_wrong_moves_the_vehicle_little(name: str, afte
 
 def test_near_the_ground_no_lift_is_taken_away_and_all_may_be_added() -> None:
     def lift(height: float, push: float) -> float:
-        observer = DisturbanceObserver(LAW, ObserverLimits())
+        observer = DisturbanceObserver(LAW, ObserverLimits(authority=3.0))
         for k in range(200):
             state = State(
                 (0.0, 0.0, height), (0.0, 0.0, push * DT * k), (1.0, 0.0, 0.0, 0.0), height, 16.0, ZERO,
