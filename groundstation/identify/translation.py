@@ -250,7 +250,9 @@ def judged(
     scale = Scale(
         before * problem.samples, lambda share: f": {np.sqrt(max(share, 0.0) * before):.3f} m/s² RMS"
     )
-    named, absent = judge(search, found, here, scale, lambda name: seen_as(problem, name, here), doubt)
+    named, absent = judge(
+        search, found, here, scale, lambda name: seen_as(problem, name, here), doubt, entire
+    )
     return with_ridges(named, ridges(entire, here, found.names)), absent
 
 

@@ -15,7 +15,7 @@ from scipy import special
 from trueflight.groundstation.identify.doubt import Weighed, Weighing
 from trueflight.groundstation.identify.fitting import Fit, variance_per_independent_sample
 from trueflight.groundstation.identify.order import answers
-from trueflight.groundstation.identify.search import Choice, Search, State
+from trueflight.groundstation.identify.search import Choice, Problem, Search, State
 from trueflight.groundstation.results import EffectVerdict, ParameterEstimate
 from trueflight.models.effect import Effect
 
@@ -47,12 +47,15 @@ def judge(
     scale: Scale,
     also: Callable[[str], tuple[str, ...]] = lambda _: (),
     doubt: Weighing | None = None,
+    entire: Problem | None = None,
 ) -> tuple[list[EffectVerdict], list[EffectVerdict]]:
     """Verdicts on what was found, the largest first, and on the other candidates, in the order of the catalogue.
 
     `figures` is the fit that values and p-values are taken from, `also` names what else an effect may stand for. With
-    `doubt`, where more is left than noise, an effect is only called missing that is of one size throughout.
+    `doubt`, where more is left than noise, an effect is only called missing that is of one size throughout. `entire`
+    is what `figures` were fitted to, where the search saw only parts of it.
     """
+    fitted_to = search.problem if entire is None else entire
     rivals = {c: search.rivals(current, c) for c in current.choices}
     lost = {c: search.without(current, c).fit.sse - current.fit.sse for c in current.choices}
     ranked = sorted(((size / scale.before, choice) for choice, size in lost.items()), reverse=True)
@@ -62,7 +65,7 @@ def judge(
         weighed = None if doubt is None else doubt.of(effect.name)
         if doubt is not None and doubt.quiet and weighed is not None and weighed.steady:
             weighed = None
-        after = answers(search.problem, figures, effect.name) if scale.seen_in != "rotation" else None
+        after = answers(fitted_to, figures, effect.name) if scale.seen_in != "rotation" else None
         sure = not same and (weighed is None or weighed.holds) and _somewhere(figures, effect.name)
         sure = sure and after is None
         small = sure and not search.problem.visible(lost[choice])

@@ -2,15 +2,20 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import signal
 
 from trueflight.groundstation.identify.fitting import Fit, FreeParameter, critical_value, robust_covariance
+from trueflight.groundstation.identify.order import answers
 from trueflight.groundstation.identify.search import Choice, Search, State, sizes, whole
+from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.identify.verdicts import Scale, judge
+from trueflight.groundstation.reading import read_flight
 from trueflight.models.effect import Effect, Parameter, Stage
+from trueflight.models.model import rigid_body_model
 
 T = np.arange(0.0, 60.0, 0.04)
 
@@ -146,3 +151,20 @@ def test_what_acts_through_another_comes_with_it_or_not_at_all() -> None:
 
 def test_a_column_that_hardly_moves_is_not_excited() -> None:
     assert verdicts(Columns(A + noise(5), {"a": A, "still": 1e-3 * B}))["still"] == "not_excited"
+
+
+def test_a_long_flight_is_asked_for_its_order_by_the_samples_that_were_fitted(monkeypatch) -> None:
+    # the search sees parts of a long flight, the figures are of all of it
+    monkeypatch.setattr("trueflight.groundstation.identify.translation.LONG", 40.0)
+    monkeypatch.setattr("trueflight.groundstation.identify.translation.PART", 10.0)
+    asked = []
+
+    def looked(problem, figures, effect):
+        asked.append((sum(int(m.used.sum()) for m in problem.measurements), len(figures.residual)))
+        return answers(problem, figures, effect)
+
+    monkeypatch.setattr("trueflight.groundstation.identify.verdicts.answers", looked)
+    flight = read_flight(Path("samples/rotorpy/rotor_drag/identify.parquet"))
+    found = diagnose(flight.part(slice(0, 4500)), rigid_body_model(flight.vehicle, None))
+    assert [e.name for e in found.effects if e.verdict == "missing"] == ["rotor_drag"]
+    assert asked and all(rows == fitted for rows, fitted in asked)
