@@ -20,7 +20,7 @@ from trueflight.models.export_graph import simplify
 from trueflight.models.features import feature_matrix, feature_names, features_of_flight
 from trueflight.models.flight import Flight
 from trueflight.models.model import Model
-from trueflight.models.network import folded_layers
+from trueflight.models.network import Network, folded_layers
 from trueflight.models.prediction import error_acceleration, motion_of_features
 
 GOLDEN = 8
@@ -43,7 +43,7 @@ class Correction(torch.nn.Module):
         ]
         self.network: torch.nn.Module | None = None
         if model.network is not None:
-            self.network = sequential(folded_layers(model.network, names))
+            self.network = network_module(folded_layers(model.network, names))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Error acceleration of each row."""
@@ -53,6 +53,28 @@ class Correction(torch.nn.Module):
         columns = {name: features[:, i] for i, name in enumerate(self.names)}
         known: Any = error_acceleration(motion_of_features(columns, self.vehicle), self.chain)
         return known if learnt is None else known + learnt
+
+
+class Fading(torch.nn.Module):
+    """A network whose fourth output, where it is positive, multiplies the first three; nothing is left elsewhere."""
+
+    def __init__(self, layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+        super().__init__()
+        (weights, biases), hidden = layers[-1], sequential(layers[:-1])
+        self.hidden = torch.nn.Sequential(*hidden, torch.nn.ReLU())
+        self.delta = sequential([(weights[:3], biases[:3])])
+        self.share = torch.nn.Sequential(*sequential([(weights[3:], biases[3:])]), torch.nn.ReLU())
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """What is left of each row's error acceleration."""
+        h = self.hidden(features)
+        faded: torch.Tensor = self.delta(h) * self.share(h)
+        return faded
+
+
+def network_module(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Module:
+    """The folded `layers` of a network (N, F) -> (N, 3), with its fade where it has one."""
+    return sequential(layers) if len(layers[-1][1]) == 3 else Fading(layers)
 
 
 def sequential(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Sequential:
@@ -80,8 +102,10 @@ def not_exported(model: Model) -> tuple[str, ...]:
 def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] | None = None) -> bytes:
     """The model as an ONNX file, effects and network in one graph, with golden vectors taken from `flights`.
 
-    The training range is the network's own, and that of `flights` where there is no network. `actuation` holds
-    what is known of the path from command to motion, by the names of `models.contract.ACTUATION_LIMITS`.
+    The range in which the file may be believed is that of `flights`, together with a network's own; beside a network
+    that does not fade by itself it is the network's alone. Golden vectors of one that does are in its range, half
+    faded and far outside. `actuation` holds what is known of the path from command to motion, by the names of
+    `models.contract.ACTUATION_LIMITS`.
 
     Raises `InputError` where a flight lacks position, velocity, attitude or command.
     """
@@ -93,19 +117,16 @@ def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] |
         ]
     )
     module = Correction(model, names).eval()
-    rows = np.linspace(0, len(table) - 1, GOLDEN).astype(int)
+    given = table[np.linspace(0, len(table) - 1, GOLDEN).astype(int)]
+    if model.network is not None and model.network.margin is not None:
+        given = np.concatenate([given, _outside(model.network, names, given[0])])
     with torch.no_grad():
-        golden = module(torch.from_numpy(table[rows])).numpy()
+        golden = module(torch.from_numpy(given)).numpy()
     units = {**contract.FEATURES, **contract.YAW_FEATURES}
-    low, high = (
-        dict(zip(names, table.min(axis=0), strict=True)),
-        dict(zip(names, table.max(axis=0), strict=True)),
-    )
+    low, high = _believed(model, names, table)
     data_hash = model.data_hash or "+".join(f.data_hash for f in flights)
     links: list[dict[str, object]] = [{"effect": e.name, "parameters": v} for e, v in module.chain]
     if (network := model.network) is not None:
-        low.update(zip(network.features, network.low, strict=True))
-        high.update(zip(network.features, network.high, strict=True))
         data_hash = network.data_hash
         links.append(
             {"effect": "network", "parameters": {"hash": network.hash, "layers": list(network.widths)}}
@@ -136,12 +157,39 @@ def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] |
         ),
         contract.KEY_CHAIN: json.dumps(links),
         contract.KEY_DATA_HASH: data_hash,
-        contract.KEY_GOLDEN_FEATURES: json.dumps(table[rows].tolist()),
+        contract.KEY_GOLDEN_FEATURES: json.dumps(given.tolist()),
         contract.KEY_GOLDEN_DELTA: json.dumps(golden.tolist()),
     }
     if actuation:
         metadata[contract.KEY_ACTUATION] = json.dumps(dict(actuation))
     return _with_metadata(_graph(module, table[: max(2, GOLDEN)]), metadata)
+
+
+def _believed(
+    model: Model, names: tuple[str, ...], table: np.ndarray
+) -> tuple[dict[str, float], dict[str, float]]:
+    """The range of each feature in which a file may be believed: lowest and greatest by name, from the features
+    `table` (N, F) of its flights and from its network."""
+    low, high = (dict(zip(names, end, strict=True)) for end in (table.min(axis=0), table.max(axis=0)))
+    if (network := model.network) is not None:
+        fades = network.margin is not None
+        for name, least, most in zip(network.features, network.low, network.high, strict=True):
+            low[name] = min(low[name], least) if fades else least
+            high[name] = max(high[name], most) if fades else most
+    return low, high
+
+
+def _outside(network: Network, names: tuple[str, ...], row: np.ndarray) -> np.ndarray:
+    """Two rows of features (2, F) like `row` (F,), but with one feature half a margin and two margins beyond the
+    network's range, and all others in it."""
+    assert network.margin is not None
+    rows = np.stack([row, row])
+    for name, low, high in zip(network.features, network.low, network.high, strict=True):
+        column = names.index(name)
+        rows[:, column] = np.clip(rows[:, column], low, high)
+    last = names.index(network.features[-1])
+    rows[:, last] = network.high[-1] + np.array([0.5, 2.0]) * network.margin[-1]
+    return rows
 
 
 def _graph(module: torch.nn.Module, example: np.ndarray) -> onnx.ModelProto:

@@ -24,6 +24,7 @@ from trueflight.models.outside import shown
 
 Layer = tuple[Array, Array]
 """Weights (outputs, inputs) and biases (outputs,)."""
+_Layer = tuple[np.ndarray, np.ndarray]
 
 MOST_LAYERS = 8
 WIDEST = 4096
@@ -37,7 +38,9 @@ class Network:
     `features` are names of `models.contract`, in the order of the inputs; `centre`, `scale` (F,) normalise them;
     `layers` are weights (outputs, inputs) and biases, float32, with rectified linear units between; `output_scale`
     (3,) in m/s² turns the last layer's output into an acceleration. `low`, `high` (F,) are the range of the features
-    in training; `data_hash` tells the flights; `seed` and `recipe` how it was trained; `fit` holds the figures:
+    in training; `margin` (F,), in the unit of each feature, is how far beyond it that feature alone takes the network
+    to nothing, and None in files of before: they do not fade by themselves. `data_hash` tells the flights; `seed` and
+    `recipe` how it was trained; `fit` holds the figures:
     `train_rms`, `validation_rms`, `noise_floor` and each by axis (m/s²), `epochs`, `seconds`.
     """
 
@@ -52,6 +55,7 @@ class Network:
     seed: int = 0
     recipe: str = ""
     fit: Mapping[str, float] = field(default_factory=dict)
+    margin: np.ndarray | None = None
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Network) and network_table(self) == network_table(other)
@@ -91,22 +95,38 @@ def propagate(layers: Sequence[Layer], x: Array) -> Array:
 
 
 def error_acceleration_of(network: Network, features: Array) -> Array:
-    """Error acceleration (N, 3), heading frame, m/s², of features (N, F) in the order of `network.features`."""
+    """Error acceleration (N, 3), heading frame, m/s², of features (N, F) in the order of `network.features`; outside
+    the training range what is left of it."""
     xp = array_namespace(features)
     kind = features.dtype
     centre, scale, out = (
         xp.asarray(np.asarray(a), dtype=kind) for a in (network.centre, network.scale, network.output_scale)
     )
     layers = [(xp.asarray(w, dtype=kind), xp.asarray(b, dtype=kind)) for w, b in network.layers]
-    return propagate(layers, (features - centre) / scale) * out
+    delta = propagate(layers, (features - centre) / scale) * out
+    return delta if network.margin is None else delta * acting_share(network, features)[:, None]
+
+
+def acting_share(network: Network, features: Array) -> Array:
+    """Share (N,) of the network that acts at features (N, F): 1 in its training range, and less by how far outside
+    each feature is, in its `margin`, until nothing is left."""
+    xp = array_namespace(features)
+    if network.margin is None:
+        return 0.0 * features[:, 0] + 1.0
+    low, high, margin = (
+        xp.asarray(np.asarray(a), dtype=features.dtype) for a in (network.low, network.high, network.margin)
+    )
+    outside = xp.clip(low - features, 0.0, None) + xp.clip(features - high, 0.0, None)
+    return xp.clip(1.0 - xp.sum(outside / margin, axis=-1), 0.0, None)
 
 
 def folded_layers(network: Network, names: Sequence[str]) -> list[tuple[np.ndarray, np.ndarray]]:
     """The layers, weights (K, F) and biases (K,) in float32, for raw features in the order of `names`, with all scaling
     inside: what is deployed.
 
-    Features that the network does not know get weights of zero. Raises `InputError` where one that it needs is not
-    among `names`.
+    One that fades has four outputs: where the fourth is positive, the first three are multiplied by it, and nothing is
+    left where it is not (`acting_share`). Features that the network does not know get weights of zero. Raises
+    `InputError` where one that it needs is not among `names`.
     """
     absent = [n for n in network.features if n not in names]
     if absent:
@@ -119,9 +139,47 @@ def folded_layers(network: Network, names: Sequence[str]) -> list[tuple[np.ndarr
     weights = np.zeros((len(first), len(names)))
     weights[:, [list(names).index(n) for n in network.features]] = scaled
     layers[0] = (weights, biases - scaled @ network.centre)
+    if network.margin is not None and len(layers) == 1:
+        layers = _with_hidden_layer(*layers[0])
     last, biases = layers[-1]
     layers[-1] = (last * network.output_scale[:, None], biases * network.output_scale)
+    if network.margin is not None:
+        layers = _beside(layers, _share_layers(network, names, len(layers)))
     return [(w.astype(np.float32), b.astype(np.float32)) for w, b in layers]
+
+
+def _with_hidden_layer(weights: np.ndarray, biases: np.ndarray) -> list[_Layer]:
+    """One layer as two with rectified units between that leave it a line: each input's positive part, and its negative
+    one."""
+    whole = np.eye(weights.shape[1])
+    halves = np.concatenate([whole, -whole]), np.zeros(2 * len(whole))
+    return [halves, (np.concatenate([weights, -weights], axis=1), biases)]
+
+
+def _share_layers(network: Network, names: Sequence[str], count: int) -> list[_Layer]:
+    """`acting_share` of raw features in the order of `names` as `count` layers (2 at least) with rectified units
+    between, before its own rectification: how far each feature is below and above its range, their sum, 1 less it."""
+    f = len(network.features)
+    pick = np.zeros((f, len(names)))
+    pick[range(f), [list(names).index(n) for n in network.features]] = 1.0 / np.asarray(network.margin, float)
+    first = np.concatenate([-pick, pick])
+    ends = np.concatenate([network.low, -network.high]) / np.tile(np.asarray(network.margin, float), 2)
+    layers: list[_Layer] = [(first, ends)]
+    for _ in range(count - 2):
+        layers.append((np.ones((1, len(layers[-1][1]))), np.zeros(1)))
+    layers.append((-np.ones((1, len(layers[-1][1]))), np.ones(1)))
+    return layers
+
+
+def _beside(layers: list[_Layer], others: list[_Layer]) -> list[_Layer]:
+    """Two chains of layers with the same inputs as one, the outputs of the second behind those of the first."""
+    (w, b), (v, c) = layers[0], others[0]
+    joined = [(np.concatenate([w, v]), np.concatenate([b, c]))]
+    for (w, b), (v, c) in zip(layers[1:], others[1:], strict=True):
+        whole = np.zeros((len(b) + len(c), w.shape[1] + v.shape[1]))
+        whole[: len(b), : w.shape[1]], whole[len(b) :, w.shape[1] :] = w, v
+        joined.append((whole, np.concatenate([b, c])))
+    return joined
 
 
 def features_of_motion(motion: Motion, names: Sequence[str]) -> Array:
@@ -189,6 +247,7 @@ def network_table(network: Network) -> dict[str, Any]:
         "output_scale": _encode(network.output_scale),
         "low": _encode(network.low),
         "high": _encode(network.high),
+        **({} if network.margin is None else {"margin": _encode(network.margin)}),
         "data_hash": network.data_hash,
         "seed": network.seed,
         "recipe": network.recipe,
@@ -232,11 +291,14 @@ def network_from_table(table: object, where: str) -> Network:
         seed=_typed(table, "seed", where, int, 0),
         recipe=_typed(table, "recipe", where, str, ""),
         fit=_typed(table, "fit", where, dict, {}),
+        margin=_decode(table, "margin", where, f) if "margin" in table else None,
     )
     if any(isinstance(value, bool) or not isinstance(value, int | float) for value in network.fit.values()):
         raise InputError(f"{where}: 'fit' is {shown(dict(network.fit))}, not an object of numbers")
     if not np.all(network.scale > 0.0):
         raise InputError(f"{where}: 'scale' must be positive; restore the file from a copy")
+    if network.margin is not None and not np.all(network.margin > 0.0):
+        raise InputError(f"{where}: 'margin' must be positive; restore the file from a copy")
     if not np.all(network.low <= network.high):
         raise InputError(
             f"{where}: the training range 'low' to 'high' is empty; restore the file from a copy"

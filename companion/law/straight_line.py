@@ -106,15 +106,18 @@ class StraightLine:
     def __init__(self, onnx: bytes, width: int) -> None:
         graph = _Graph(decoded(onnx).graph, width)
         self._known = graph.function()
-        layers = graph.layers
+        layers, self._fades = graph.layers, graph.fades
         self._network = _Network(layers, width) if layers else None
 
     def __call__(self, rows: Rows) -> Sequence[Sequence[float]]:
         """Three accelerations for each row."""
+        learnt: Sequence[Sequence[float]]
         known, network = self._known, self._network
         if network is None:
             return [known(row) for row in rows]
         learnt = network.rows(rows)
+        if self._fades:
+            learnt = [_faded(*row) for row in learnt]
         if known is _nothing:
             return learnt
         both: list[Sequence[float]] = []
@@ -128,12 +131,19 @@ def _nothing(row: Sequence[float]) -> tuple[float, float, float]:
     return 0.0, 0.0, 0.0
 
 
+def _faded(x: float, y: float, z: float, share: float) -> tuple[float, float, float]:
+    if share <= 0.0:  # false for NaN: that stays it, and so does what is infinite
+        share = 0.0
+    return share * x, share * y, share * z
+
+
 Layer = tuple[np.ndarray, np.ndarray, bool]
 """Weights (F, K), biases (K,), and whether a rectifier follows."""
 
 
 class _Network:
-    """Layers on rows of features, in 32 bits; biases are a last row of the weights, for inputs that end with 1."""
+    """Layers on rows of features, in 32 bits, the last one with three outputs or, where it fades, four; biases are a
+    last row of the weights, for inputs that end with 1."""
 
     def __init__(self, layers: Sequence[Layer], width: int) -> None:
         self._layers = []
@@ -149,7 +159,7 @@ class _Network:
         self._rooms: dict[int, _Room] = {}
 
     def rows(self, rows: Rows) -> list[list[float]]:
-        """Three accelerations for each row."""
+        """The last layer's outputs for each row."""
         room = self._rooms.get(len(rows))
         if room is None:
             room = self._rooms[len(rows)] = _Room(self._layers, self._width, len(rows))
@@ -171,7 +181,7 @@ class _Room:
         self._answer = given.tolist
 
     def answer(self, rows: Rows) -> list[list[float]]:
-        """Three accelerations for each row."""
+        """The last layer's outputs for each row."""
         flat: list[float] = []
         for row in rows:
             flat += row
@@ -195,12 +205,15 @@ class _Graph:
         self._matrices: dict[bytes, list[Layer]] = {contract.INPUT_NAME.encode(): []}
         self._unsqueezed: dict[bytes, str] = {}
         self._stacks: dict[bytes, list[str]] = {}
-        self._sum: tuple[list[str], list[Layer]] | None = None
+        self._faded: dict[bytes, list[Layer]] = {}
+        self._sum: tuple[list[str], bytes] | None = None
         if graph.sparse_initializer or not 0 < len(graph.node) <= _MOST_NODES:
             raise NoStraightLine(f"a graph of {len(graph.node)} nodes, or with sparse constants")
         for node in graph.node:
             self._take(node)
-        self._stack, self.layers = self._answer()
+        self._stack, learnt = self._answer()
+        self.fades = learnt in self._faded
+        self.layers = self._ended(learnt) if learnt else []
 
     def function(self) -> Callable[[Sequence[float]], tuple[float, float, float]]:
         """From one row of features to what the columns add to the answer."""
@@ -212,18 +225,22 @@ class _Graph:
         known: Callable[[Sequence[float]], tuple[float, float, float]] = names["known"]
         return known
 
-    def _answer(self) -> tuple[list[str], list[Layer]]:
-        """The three columns and the layers whose sum is the graph's output."""
+    def _answer(self) -> tuple[list[str], bytes]:
+        """The three columns, and the name of the network, whose sum is the graph's output."""
         name = contract.OUTPUT_NAME.encode()
         if self._sum is not None:
             return self._sum
         if name in self._stacks:
-            return self._stacks[name], []
-        if self._matrices.get(name):
-            return [], self._ended(self._matrices[name])
+            return self._stacks[name], b""
+        if self._matrices.get(name) or name in self._faded:
+            return [], name
         raise NoStraightLine("an output that is neither three columns nor a chain of layers")
 
-    def _ended(self, layers: list[Layer]) -> list[Layer]:
+    def _ended(self, name: bytes) -> list[Layer]:
+        """The layers of a network of this name: three outputs, and the share of one that fades."""
+        if name in self._faded:
+            return self._faded[name]
+        layers = self._matrices[name]
         if layers[-1][0].shape[1] != 3:
             raise NoStraightLine("a network with other than three outputs")
         return layers
@@ -234,7 +251,8 @@ class _Graph:
         if node.domain or len(node.output) != 1 or not given or self._sum is not None:
             raise NoStraightLine(f"a node {kind} that is not a plain operator")
         out = bytes(node.output[0])
-        if out in self._columns or out in self._matrices or out in self._stacks or out in self._constants:
+        taken = (self._columns, self._matrices, self._faded, self._stacks, self._constants)
+        if any(out in names for names in taken):
             raise NoStraightLine("a name that is given twice")
         options = {bytes(one.name): one for one in node.attribute}
         if kind == "Gather":
@@ -243,7 +261,7 @@ class _Graph:
             self._unsqueeze(out, given)
         elif kind == "Concat":
             self._concat(out, given, options)
-        elif given[0] in self._matrices or given[0] in self._stacks or given[-1] in self._matrices:
+        elif any(name in self._matrices or name in self._stacks or name in self._faded for name in given):
             self._matrix(kind, out, given, options)
         else:
             self._column(kind, out, given, options)
@@ -276,9 +294,13 @@ class _Graph:
         before = self._matrices.get(given[0])
         if kind == "Add" and len(given) == 2:
             stack, other = (given[0], given[1]) if given[0] in self._stacks else (given[1], given[0])
-            if stack in self._stacks and self._matrices.get(other) and out == contract.OUTPUT_NAME.encode():
-                self._sum = self._stacks[stack], self._ended(self._matrices[other])
+            whole = self._matrices.get(other) or other in self._faded
+            if stack in self._stacks and whole and out == contract.OUTPUT_NAME.encode():
+                self._sum = self._stacks[stack], other
                 return
+        if kind == "Mul" and len(given) == 2 and given[1] in self._matrices:
+            self._fade(out, self._matrices.get(given[0], []), self._matrices[given[1]])
+            return
         if before is None:
             raise NoStraightLine(f"{kind} of a matrix")
         if kind == "Relu" and len(given) == 1 and before and not before[-1][2]:
@@ -297,6 +319,17 @@ class _Graph:
             self._matrices[out] = [*before[:-1], (weights, biases + more, False)]
         else:
             raise NoStraightLine(f"{kind} of a matrix")
+
+    def _fade(self, out: bytes, network: list[Layer], share: list[Layer]) -> None:
+        """Three outputs times a fourth, rectified one: the heads of the same layers, in this order."""
+        heads = bool(network) and bool(share) and len(network) == len(share)
+        if not heads or any(a is not b for a, b in zip(network[:-1], share[:-1], strict=True)):
+            raise NoStraightLine("a product of networks that are not the same up to their last layer")
+        (weights, biases, rectified), (more, bias, cut) = network[-1], share[-1]
+        if (len(biases), len(bias)) != (3, 1) or rectified or not cut:
+            raise NoStraightLine("a product of other than three outputs and a rectified fourth")
+        last = np.concatenate([weights, more], axis=1), np.concatenate([biases, bias]), False
+        self._faded[out] = [*network[:-1], last]
 
     def _gemm(self, given: list[bytes], options: dict[bytes, Any]) -> Layer:
         """Weights and biases; `alpha` and `beta` of 1, which torch leaves out or, with them, 0 as `i` and 1 as `f`."""

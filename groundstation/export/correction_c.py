@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -25,7 +25,7 @@ from trueflight.models import contract
 from trueflight.models.effect import Array, Effect, Stage
 from trueflight.models.features import feature_names
 from trueflight.models.model import Model
-from trueflight.models.network import folded_layers
+from trueflight.models.network import Network, folded_layers
 from trueflight.models.prediction import error_acceleration, motion_of_features
 from trueflight.models.vehicle import GRAVITY
 
@@ -63,7 +63,9 @@ def write(model: Model, file: Deployed) -> Written:
     """The C header of a model, with what its deployed `file` says. Raises `InputError` where a user's effect cannot be
     traced."""
     lines = tuple(_lines(model))
-    layers = [] if model.network is None else folded_layers(model.network, feature_names(model))
+    network, names = model.network, feature_names(model)
+    # its fade is a function of its own here: as units of the layers it would be mostly zeros, in flash
+    layers = [] if network is None else folded_layers(replace(network, margin=None), names)
     notes = tuple(_notes(file, layers))
     said = (f"{model.vehicle.name}, {model.label}, written by trueflight from model {file.hash}", *notes)
     held = [
@@ -179,7 +181,7 @@ static inline float correction_square(float x)
 {{
     return x * x;
 }}
-{_layers(layers)}
+{_share(model.network, names)}{_layers(layers, model.network)}
 /* Error acceleration in m/s^2, heading frame: what the vehicle does beyond its hover linearisation. The cascade
    commands its own acceleration less this. */
 static inline void correction(const float features[CORRECTION_FEATURES], float delta[3])
@@ -308,9 +310,38 @@ def _statement(text: str) -> str:
     )
 
 
-def _layers(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> str:
+def _share(network: Network | None, names: Sequence[str]) -> str:
+    """How much of a network that fades acts, as a function; nothing for one that does not."""
+    if network is None or network.margin is None:
+        return ""
+    count = len(network.features)
+    places = ", ".join(f"CORRECTION_{name.upper()}" for name in network.features)
+    places = textwrap.fill(places, _WIDTH, subsequent_indent="        ", break_on_hyphens=False)
+    low, high = _floats(network.low), _floats(network.high)
+    return f"""
+/* Share of the network that acts: 1 in the range of the flights that it was trained on, 0 far outside. */
+static inline float correction_share(const float features[CORRECTION_FEATURES])
+{{
+    static const int place[{count}] = {{{places}}};
+    static const float low[{count}] = {{{low}}};
+    static const float high[{count}] = {{{high}}};
+    static const float per_unit[{count}] = {{{_floats(1.0 / network.margin)}}};
+    float outside = 0.0F;
+    for (int i = 0; i < {count}; ++i) {{
+        const float x = features[place[i]];
+        if (x < low[i])
+            outside += (low[i] - x) * per_unit[i];
+        else if (!(x <= high[i]))
+            outside += (x - high[i]) * per_unit[i];
+    }}
+    return outside < 1.0F ? 1.0F - outside : 0.0F;
+}}
+"""
+
+
+def _layers(layers: Sequence[tuple[np.ndarray, np.ndarray]], network: Network | None) -> str:
     """The network as a function: two rows of values that take turns, linear units rectified between the layers."""
-    if not layers:
+    if not layers or network is None:
         return ""
     tables, calls = [], []
     widest = max(len(biases) for _, biases in layers)
@@ -333,6 +364,11 @@ def _layers(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> str:
         if len(layers) == 1
         else f"    float one[{widest}]" + (";\n" if len(layers) == 2 else f", other[{widest}];\n")
     )
+    if network.margin is not None:
+        calls += [
+            "    const float share = correction_share(features);\n",
+            "    for (int i = 0; i < 3; ++i)\n        delta[i] *= share;\n",
+        ]
     return f"""
 static inline void correction_layer(const float *weights, const float *biases, int rows, int columns, const float *in,
                                     float *out, int rectified)

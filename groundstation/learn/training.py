@@ -70,6 +70,9 @@ OWN = Recipe("default", "adamw", 0.02, 1024, 60, "one_cycle", weight_decay=0.1, 
 RANGE_TAIL = 0.001
 """Share of the samples at each end of a feature that does not count to the training range: a network has learnt
 nothing where it has seen a handful of samples."""
+FADE = 0.25
+"""Share of the training range by which a feature may leave it until nothing of the network acts: where the watch on
+board takes a whole model to nothing, too."""
 RECIPES = {"default": OWN, "paper": PAPER}
 
 
@@ -178,6 +181,7 @@ class _Run:
         self.scale = np.maximum(x.std(axis=0), [_FLOORS[units[n]] for n in samples.names]).astype(np.float32)
         self.out = np.maximum(y.std(axis=0), 1e-3).astype(np.float32)
         self.low, self.high = np.quantile(x, (RANGE_TAIL, 1.0 - RANGE_TAIL), axis=0).astype(np.float32)
+        self.margin = np.maximum(FADE * (self.high - self.low), [_FLOORS[units[n]] for n in samples.names])
         self.x, self.y = (self._normalised(samples.only(side)) for side in sides)
         # squared error in (m/s²)², whatever the scale of each output
         self.weight = torch.from_numpy(self.out**2)
@@ -366,6 +370,7 @@ class _Run:
             seed=self.seed,
             recipe=self.recipe.name,
             fit=fit,
+            margin=self.margin.astype(np.float32),
         )
         return Training(network, tuple(self.history), self.best, *self.sides, interrupted=interrupted)
 
@@ -419,7 +424,8 @@ def memory_share(samples: Samples, training: Training) -> float:
     """
     held = samples.only(training.validation)
     features = held.with_features(training.network.features).features
-    left = (held.target - error_acceleration_of(training.network, features))[:, 2].astype(float)
+    whole = replace(training.network, margin=None)  # where it fades it leaves over more than a lag
+    left = (held.target - error_acceleration_of(whole, features))[:, 2].astype(float)
     thrust = held.features[:, held.names.index("T")].astype(float)
     following = (np.diff(held.t, prepend=-1.0) < 1.5 * held.period) & (np.diff(held.flight, prepend=-1) == 0)
     rate = np.where(following, np.diff(thrust, prepend=thrust[0]) / held.period, 0.0)

@@ -180,6 +180,48 @@ def test_what_is_not_on_the_list_has_no_straight_line(change: Any) -> None:
         StraightLine(changed(file, change), WIDTH)
 
 
+def fading_file(
+    share: tuple[str, ...] = ("Gemm", "Relu"), order: tuple[str, str] = ("three", "share"), width: int = 1
+) -> bytes:
+    """A network times the share of it that acts, which comes from the same layer."""
+    draw = np.random.default_rng(0)
+    constants = {
+        "w": 0.1 * draw.normal(size=(7, WIDTH)), "d": draw.normal(size=(3, 7)), "s": draw.normal(size=(width, 7)),
+        "c": np.full(width, 0.5), "b": np.zeros(3),
+    }  # fmt: skip
+    nodes = [
+        helper.make_node("Gemm", [contract.INPUT_NAME, "w"], ["h0"], transB=1),
+        helper.make_node("Relu", ["h0"], ["h"]),
+        helper.make_node("Gemm", ["h", "d", "b"], ["three"], transB=1),
+        helper.make_node("Gemm", ["h", "s", "c"], ["s0" if len(share) > 1 else "share"], transB=1),
+    ]
+    nodes += [helper.make_node(kind, ["s0"], ["share"]) for kind in share[1:]]
+    nodes.append(helper.make_node("Mul", list(order), [contract.OUTPUT_NAME]))
+    floats = {name: np.asarray(value, dtype=np.float32) for name, value in constants.items()}
+    return packed(nodes, floats, lambda features: np.zeros((len(features), 3)))
+
+
+def test_a_network_that_fades_is_a_straight_line_and_what_only_looks_like_one_is_not() -> None:
+    rows = features(60)
+    wanted = np.array([Runtime(_open(fading_file()), WIDTH)([row])[0] for row in rows])
+    np.testing.assert_allclose(StraightLine(fading_file(), WIDTH)(rows), wanted, atol=1e-4)
+    assert np.any(np.all(wanted == 0.0, axis=1)) and np.any(wanted != 0.0)
+    for other in (
+        fading_file(("Gemm",)),
+        fading_file(order=("share", "three")),
+        fading_file(order=("three", "three")),
+        fading_file(width=3),
+    ):
+        with pytest.raises(NoStraightLine):
+            StraightLine(other, WIDTH)
+
+    def from_the_features(graph: Any) -> None:
+        graph.node[3].input[0] = contract.INPUT_NAME
+
+    with pytest.raises(NoStraightLine):
+        StraightLine(changed(fading_file(), from_the_features), WIDTH)
+
+
 def test_constants_that_are_not_finite_have_no_straight_line() -> None:
     drawn = Drawn(6, 1, False, ("Neg",))
     drawn.constants["bad"] = np.array(math.inf, dtype=np.float32)

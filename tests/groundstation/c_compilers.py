@@ -67,20 +67,20 @@ FLIGHT = read_flight(SAMPLES / "rotorpy" / "rotor_drag" / "identify.parquet")
 NAMES = tuple(contract.FEATURES)
 
 
-def a_network(widths: tuple[int, ...], seed: int = 0) -> Network:
+def a_network(widths: tuple[int, ...], seed: int = 0, names: tuple[str, ...] = NAMES) -> Network:
     g = np.random.default_rng(seed)
     layers = tuple(
         (g.normal(0, 0.6, (b, a)).astype(np.float32), g.normal(0, 0.3, b).astype(np.float32))
-        for a, b in pairwise([len(NAMES), *widths, 3])
+        for a, b in pairwise([len(names), *widths, 3])
     )
     return Network(
-        features=NAMES,
-        centre=g.normal(0, 1, len(NAMES)).astype(np.float32),
-        scale=g.uniform(0.5, 2, len(NAMES)).astype(np.float32),
+        features=names,
+        centre=g.normal(0, 1, len(names)).astype(np.float32),
+        scale=g.uniform(0.5, 2, len(names)).astype(np.float32),
         layers=layers,
         output_scale=np.array([0.5, 0.6, 0.8], np.float32),
-        low=np.full(len(NAMES), -1, np.float32),
-        high=np.full(len(NAMES), 1, np.float32),
+        low=np.full(len(names), -1, np.float32),
+        high=np.full(len(names), 1, np.float32),
         data_hash="abc",
     )
 

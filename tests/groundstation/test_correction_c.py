@@ -1,6 +1,7 @@
 """The correction as C: the same numbers as ONNX Runtime's, natively and on the autopilot's processor."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import programs
 import pytest
 from c_compilers import (
     FLIGHT,
+    NAMES,
     SAMPLES,
     a_network,
     evaluate,
@@ -27,6 +29,7 @@ from trueflight.models.errors import InputError
 from trueflight.models.export import export_onnx
 from trueflight.models.features import feature_names
 from trueflight.models.model import Model, Term, rigid_body_model, write_model
+from trueflight.models.network import Network, acting_share
 
 needs_gcc = pytest.mark.skipif(not has_native(), reason="no gcc")
 needs_arm = pytest.mark.skipif(not has_cortex_m7(), reason="no gcc-arm-none-eabi or qemu-system-arm")
@@ -52,11 +55,20 @@ def rows(model: Model, count: int = 500, seed: int = 1) -> np.ndarray:
     return np.stack([columns[name] for name in feature_names(model)], axis=1).astype(np.float32)
 
 
+def fading(network: Network) -> Network:
+    """With a range that the rows above are partly in and often outside of, some far."""
+    width = len(network.features)
+    return replace(network, low=np.zeros(width), high=np.ones(width), margin=np.linspace(20.0, 60.0, width))
+
+
 MODELS = {
     "effects": lambda: with_effects(None),
     "network": lambda: with_effects({}, a_network((16, 8))),
     "one layer": lambda: with_effects({}, a_network(())),
     "both": lambda: with_effects(None, a_network((8,))),
+    "fading": lambda: with_effects({}, fading(a_network((16, 8)))),
+    "fading line": lambda: with_effects({}, fading(a_network(()))),
+    "both, fading": lambda: with_effects(None, fading(a_network((8,), names=NAMES[2:]))),
     "nothing": lambda: with_effects({}),
 }
 
@@ -77,6 +89,12 @@ def test_c_computes_what_onnx_runtime_computes(label: str, tmp_path: Path) -> No
     scale = np.maximum(1.0, np.abs(wanted).max(axis=1, keepdims=True))
     assert np.abs((got - wanted) / scale).max() < 2e-4
     assert np.abs(wanted).max() > 1.0
+
+
+def test_rows_are_inside_between_and_outside() -> None:
+    network = fading(a_network((16, 8)))
+    share = acting_share(network, rows(with_effects({}, network)))
+    assert np.count_nonzero(share == 0.0) > 20 and np.count_nonzero((share > 0.0) & (share < 1.0)) > 20
 
 
 @needs_gcc

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trueflight.companion.law.inference import check_model
+from trueflight.companion.law.straight_line import StraightLine
 from trueflight.models import contract
 from trueflight.models.errors import InputError
 from trueflight.models.export import Correction, export_onnx, sequential
@@ -23,6 +24,7 @@ from trueflight.models.frames import rotation_matrix
 from trueflight.models.model import Term, linear_model, read_model, rigid_body_model, write_model
 from trueflight.models.network import (
     Network,
+    acting_share,
     error_acceleration_of,
     features_of_motion,
     folded_layers,
@@ -50,6 +52,13 @@ def a_network(seed: int = 0, widths: tuple[int, ...] = (16, 8), names: tuple[str
         output_scale=np.array([0.5, 0.6, 0.8], np.float32), low=low, high=low + 2, data_hash="abc", seed=seed,
         recipe="default", fit={"train_rms": 0.1},
     )  # fmt: skip
+
+
+def a_fading_network(seed: int, widths: tuple[int, ...], names: tuple[str, ...] = NAMES) -> Network:
+    """One that was trained on part of what `a_flight` does; further out it fades."""
+    features = feature_matrix(features_of_flight(a_flight()), names)
+    low, high = np.quantile(features, (0.1, 0.9), axis=0).astype(np.float32)
+    return replace(a_network(seed, widths, names), low=low, high=high, margin=2.0 * (high - low) + 0.05)
 
 
 def a_flight(n: int = 400, seed: int = 0) -> Flight:
@@ -92,6 +101,82 @@ def test_numpy_torch_and_onnx_predict_alike() -> None:
     np.testing.assert_allclose(delta, whole, atol=1e-4)
     rigid = Correction(rigid_body_model(VEHICLE), NAMES)(torch.from_numpy(features)).numpy()
     np.testing.assert_allclose(delta - rigid, by_numpy, atol=1e-4)
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 1000), st.lists(st.integers(1, 20), max_size=3), st.sampled_from([NAMES, NAMES[2:]]))
+def test_whoever_computes_a_network_that_fades_lets_the_same_of_it_act(
+    seed: int, widths: list[int], names: tuple[str, ...]
+) -> None:
+    """numpy, torch, ONNX Runtime and the companion's straight line; C is in `test_correction_c.py`."""
+    network = a_fading_network(seed, tuple(widths), names)
+    model = linear_model(VEHICLE).with_network(network)
+    inside = feature_matrix(features_of_flight(a_flight()), NAMES)
+    given = np.concatenate([inside, inside * np.float32(1.5) - np.float32(0.3), inside + np.float32(100.0)])
+    of_network = given[:, [NAMES.index(name) for name in names]]
+    share = acting_share(network, of_network)
+    assert np.all(share[-len(inside) :] == 0.0) and np.count_nonzero((share > 0.0) & (share < 1.0)) > 0
+    plain = error_acceleration_of(replace(network, margin=None), of_network)
+    wanted = plain * share[:, None]
+    np.testing.assert_allclose(error_acceleration_of(network, of_network), wanted, atol=1e-6)
+    by_torch = error_acceleration_of(network, torch.from_numpy(of_network)).numpy()
+    np.testing.assert_allclose(by_torch, wanted, rtol=1e-3, atol=1e-3)
+    onnx_file = export_onnx(model, a_flight())
+    (by_runtime,) = onnxruntime.InferenceSession(onnx_file).run(None, {contract.INPUT_NAME: given})
+    np.testing.assert_allclose(by_runtime, wanted, rtol=1e-3, atol=1e-3)
+    straight = StraightLine(onnx_file, len(NAMES))(given.tolist())
+    np.testing.assert_allclose(straight, by_runtime, rtol=1e-4, atol=1e-4)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 1000), st.integers(0, len(NAMES) - 1), st.booleans())
+def test_a_network_acts_wholly_in_its_range_and_less_with_each_step_out_of_it(
+    seed: int, feature: int, up: bool
+) -> None:
+    network = a_fading_network(seed, (8,))
+    inside = np.random.default_rng(seed).uniform(network.low, network.high)
+    assert acting_share(network, inside[None]) == 1.0
+    ways = np.linspace(0.0, 2.0, 101)
+    path = np.tile(inside, (len(ways), 1))
+    end, sign = (network.high, 1.0) if up else (network.low, -1.0)
+    path[:, feature] = end[feature] + sign * ways * network.margin[feature]
+    share = acting_share(network, path)
+    np.testing.assert_allclose(
+        share, np.clip(1.0 - ways, 0.0, None), atol=1e-5
+    )  # continuous, and 0 far outside
+    out = error_acceleration_of(network, path)
+    assert np.all(out[ways > 1.0 + 1e-6] == 0.0)
+
+
+def test_effects_are_kept_where_a_network_has_faded_and_the_file_is_believed_there() -> None:
+    """The range of the file is that of its flights; of a file of before it is the network's, effects or not."""
+    network, flight = a_fading_network(0, (8,)), a_flight()
+    model = rigid_body_model(VEHICLE)
+    features = feature_matrix(features_of_flight(flight), NAMES)
+    new, old = (
+        check_model(export_onnx(model.with_network(n), flight), VEHICLE).model
+        for n in (network, replace(network, margin=None))
+    )
+    assert [f.low for f in old.info.features] == pytest.approx(network.low.tolist())
+    assert [f.low for f in new.info.features] == pytest.approx(features.min(axis=0).tolist())
+    assert [f.high for f in new.info.features] == pytest.approx(features.max(axis=0).tolist())
+    assert new.straight and old.straight
+    away = features[0] + np.float32(0.0)
+    away[NAMES.index("u_batt")] = network.low[8] - 1.5 * network.margin[8]
+    effects = check_model(export_onnx(model, flight), VEHICLE).model
+    np.testing.assert_allclose(new(away.tolist()), effects(away.tolist()), atol=1e-5)
+    assert max(np.abs(np.subtract(old(away.tolist()), effects(away.tolist())))) > 0.01
+
+
+def test_golden_vectors_of_a_network_that_fades_are_inside_between_and_outside() -> None:
+    import onnx
+
+    network = a_fading_network(0, (8,))
+    file = export_onnx(linear_model(VEHICLE).with_network(network), a_flight())
+    meta = {one.key: one.value for one in onnx.load_from_string(file).metadata_props}
+    golden = np.array(json.loads(meta[contract.KEY_GOLDEN_FEATURES]))
+    half, far = acting_share(network, golden)[-2:]
+    assert (half, far) == (pytest.approx(0.5, abs=1e-5), 0.0)
 
 
 def test_what_a_flight_is_predicted_with_is_what_the_companion_gets() -> None:
@@ -168,6 +253,9 @@ def test_network_alone_is_a_handful_of_operations() -> None:
         export_onnx(linear_model(VEHICLE).with_network(a_network()), a_flight())
     ).graph
     assert [n.op_type for n in graph.node] == ["Gemm", "Relu", "Gemm", "Relu", "Gemm"]
+    fading = linear_model(VEHICLE).with_network(a_fading_network(0, (16, 8)))
+    graph = onnx.load_from_string(export_onnx(fading, a_flight())).graph
+    assert sorted(n.op_type for n in graph.node) == 4 * ["Gemm"] + ["Mul"] + 3 * ["Relu"]
 
 
 def test_version_with_a_network_survives_the_disk(tmp_path) -> None:
@@ -193,6 +281,9 @@ def test_version_without_a_network_reads_as_before(tmp_path) -> None:
 @given(st.integers(0, 1000), st.lists(st.integers(1, 40), min_size=1, max_size=4))
 def test_any_network_is_read_as_it_was_written(seed: int, widths: list[int]) -> None:
     network = a_network(seed, tuple(widths))
+    assert "margin" not in network_table(network)  # as files of before are
+    fading = replace(network, margin=np.full(len(NAMES), 0.5, np.float32))
+    assert network_from_table(json.loads(json.dumps(network_table(fading))), "x") == fading != network
     assert network_from_table(json.loads(json.dumps(network_table(network))), "x") == network
     assert network.parameters == sum(w.size + b.size for w, b in network.layers)
 
@@ -210,6 +301,8 @@ DAMAGE = {
     "base64": lambda t: t["layers"][0].update(biases="not base64!"),
     "finite": _nan,
     "range": lambda t: t.update(low=t["high"], high=t["low"]),
+    "margin": lambda t: t.update(margin=base64.b64encode(np.zeros(10, "<f4").tobytes()).decode()),
+    "short margin": lambda t: t.update(margin="AAAA"),
     "kind": lambda t: t.update(seed="one"),
     "not a table": lambda t: t.clear(),
 }
