@@ -187,8 +187,9 @@ def _outside(network: Network, names: tuple[str, ...], row: np.ndarray) -> np.nd
     for name, low, high in zip(network.features, network.low, network.high, strict=True):
         column = names.index(name)
         rows[:, column] = np.clip(rows[:, column], low, high)
-    last = names.index(network.features[-1])
-    rows[:, last] = network.high[-1] + np.array([0.5, 2.0]) * network.margin[-1]
+    nearest = int(np.argmin(network.margin))
+    away = network.high[nearest] + np.array([0.5, 2.0]) * network.margin[nearest]
+    rows[:, names.index(network.features[nearest])] = away
     return rows
 
 

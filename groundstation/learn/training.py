@@ -70,9 +70,13 @@ OWN = Recipe("default", "adamw", 0.02, 1024, 60, "one_cycle", weight_decay=0.1, 
 RANGE_TAIL = 0.001
 """Share of the samples at each end of a feature that does not count to the training range: a network has learnt
 nothing where it has seen a handful of samples."""
-FADE = 0.25
-"""Share of the training range by which a feature may leave it until nothing of the network acts: where the watch on
-board takes a whole model to nothing, too."""
+FADE = 0.5
+"""Share of the training range by which one feature may leave it until nothing of the network acts: chosen by
+`benchmarks/network_fade.py`, see docs/network.md."""
+FADE_LEAST = {"m": 0.2, "m/s": 0.5, "V": 0.5, "1": 0.1, "N": 1.0}
+"""The least of it, by unit: noise and trim, where training hardly moved a feature."""
+UNCOUNTED = 1e6
+"""The margin of a cosine: how far the vehicle is tilted or turned, its sine tells."""
 RECIPES = {"default": OWN, "paper": PAPER}
 
 
@@ -181,7 +185,7 @@ class _Run:
         self.scale = np.maximum(x.std(axis=0), [_FLOORS[units[n]] for n in samples.names]).astype(np.float32)
         self.out = np.maximum(y.std(axis=0), 1e-3).astype(np.float32)
         self.low, self.high = np.quantile(x, (RANGE_TAIL, 1.0 - RANGE_TAIL), axis=0).astype(np.float32)
-        self.margin = np.maximum(FADE * (self.high - self.low), [_FLOORS[units[n]] for n in samples.names])
+        self.margin = _margin(samples.names, self.low, self.high)
         self.x, self.y = (self._normalised(samples.only(side)) for side in sides)
         # squared error in (m/s²)², whatever the scale of each output
         self.weight = torch.from_numpy(self.out**2)
@@ -370,9 +374,16 @@ class _Run:
             seed=self.seed,
             recipe=self.recipe.name,
             fit=fit,
-            margin=self.margin.astype(np.float32),
+            margin=self.margin,
         )
         return Training(network, tuple(self.history), self.best, *self.sides, interrupted=interrupted)
+
+
+def _margin(names: Sequence[str], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """How far beyond `low` to `high` (F,) each feature alone takes the network to nothing, in its unit."""
+    units = {**FEATURES, **YAW_FEATURES}
+    least = [UNCOUNTED if name.startswith("cos_") else FADE_LEAST[units[name]] for name in names]
+    return np.maximum(FADE * (high - low), least).astype(np.float32)
 
 
 def _initial(inputs: int, widths: Sequence[int], seed: int) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -28,6 +28,7 @@ from trueflight.groundstation.versions.store import add_effect, find, lineage, s
 from trueflight.models.errors import InputError
 from trueflight.models.export import export_onnx
 from trueflight.models.model import linear_model, read_model, rigid_body_model
+from trueflight.models.network import acting_share
 
 BIN = Path(sys.executable).parent
 VEHICLE = Path(__file__).parents[2] / "models" / "vehicles" / "quad5" / "vehicle.toml"
@@ -226,6 +227,17 @@ def test_training_range_is_that_of_the_flights_trained_on(trained, samples) -> N
     outside = np.mean((learn < trained.network.low) | (learn > trained.network.high), axis=0)
     assert np.all(outside > 0.0)
     assert np.all(outside <= 0.0025)
+
+
+def test_a_network_acts_wholly_on_what_it_was_trained_on_and_not_at_all_far_from_it(trained, samples) -> None:
+    network = trained.network
+    features = samples.only(trained.train).with_features(network.features).features
+    share = acting_share(network, features)
+    assert np.mean(share == 1.0) > 0.97 and share.mean() > 0.995
+    for name, distance in (("z", 5.0), ("vx", 15.0), ("u_batt", -6.0)):
+        away = features.copy()
+        away[:, network.features.index(name)] += distance
+        assert acting_share(network, away).max() == 0.0
 
 
 def test_a_new_effect_drops_the_network_that_was_trained_without_it(trained, base, flights, tmp_path) -> None:
