@@ -11,6 +11,7 @@ ROOT = Path(__file__).parent.parent
 SCENARIOS = {
     ("groundstation/study/reproduce.py", "wind"),
     ("groundstation/study/controllers.py", "wind"),
+    ("groundstation/study/disturbances.py", "wind"),
 }
 """The name of an experiment, which is what its flights are flown in."""
 

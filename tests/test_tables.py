@@ -22,7 +22,9 @@ from trueflight.groundstation.commands import collect, compare_controllers, demo
 from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.writing import write_flight
-from trueflight.groundstation.study.controllers import DISTURBANCES, Cell
+from trueflight.groundstation.study.controllers import Cell
+from trueflight.groundstation.study.disturbances import DISTURBANCES, LIMITS
+from trueflight.groundstation.study.margins import Margin
 from trueflight.groundstation.study.reproduce import ARMS, SCENARIOS, Flown, Prepared, Study
 from trueflight.models.contract import CONTROLLERS
 from trueflight.models.model import rigid_body_model
@@ -207,13 +209,21 @@ def test_the_paper_and_the_demonstration(flown: Path) -> None:
         reproduce._print(Study(made, (prepared,)), SCENARIOS, False)
     flight = read_flight(ROOT / "samples" / "rotorpy" / "rotor_drag" / "identify.parquet")
     cells = [
-        Cell(seed, one.name, name, 0.01 * seed, 0.02, "finished")
+        Cell(seed, one.name, name, 0.01 * seed, 0.02, "finished", 0.4, 0.5)
         for seed in (1, 2)
         for one in DISTURBANCES
         for name in CONTROLLERS
     ]
     with figures("groundstation compare-controllers") as terminal:
         terminal.print(compare_controllers._table(cells, DISTURBANCES, CONTROLLERS, "reference"))
+        margins = [
+            Margin(seed, one.name, name, 0.1 * seed, False)
+            for seed in (1, 2)
+            for one in LIMITS
+            for name in CONTROLLERS
+        ]
+        compare_controllers._print_margins(margins, LIMITS, CONTROLLERS)
+        terminal.print(compare_controllers._table_for_real(cells[:3], cells))
     with figures("groundstation demo"):
         demo._print_real([("carries a payload", diagnose(flight, rigid_body_model(flight.vehicle)))])
 

@@ -2,88 +2,58 @@
 
 Two measures, since two camps use them: the distance to the *reference*, which everybody else reports, and the distance
 to the expected *linear behaviour*, which Carvalho et al. (ICUAS 2022) report.
-
-Disturbances after AdaptiveQuadBench (wind, force, torque, uncertainty, a weaker rotor); the winds and the figure eight
-(x 1.25 sin t, z 0.75 sin 2t) of O'Connell et al., "Neural-Fly enables rapid learning for agile flight in strong winds",
-Science Robotics 7 (2022).
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from trueflight.groundstation.evaluate.tracking import track_file
+from trueflight.groundstation.evaluate.tracking import read_designed, track
 from trueflight.groundstation.operate.processes import run_json
-from trueflight.groundstation.study.reproduce import BOTH, EFFECTS, SETTLE, Asked, Prepared, prepare
-from trueflight.models.contract import CORRECTED
+from trueflight.groundstation.study.disturbances import CHARGE, Disturbance
+from trueflight.groundstation.study.reproduce import (
+    BOTH,
+    EFFECTS,
+    SETTLE,
+    Asked,
+    Prepared,
+    prepare,
+    through_companion,
+)
+from trueflight.models.contract import CORRECTED, INDI, LQR
 from trueflight.models.controllers import check_controller, controllers
 from trueflight.models.errors import InputError
+from trueflight.models.flight import Flight
+from trueflight.models.frames import rotation_matrix
 from trueflight.models.outside import json_object, read_text
 from trueflight.models.whole_file import write_whole
 
-UNSEEN = 100
-"""Added to a seed for the trajectories: no training database holds them."""
-_CHARGE = ("--charge", "0.6")
-
-
-@dataclass(frozen=True)
-class Disturbance:
-    """What happens beside the vehicle's own truth, as words for `sim-bridge fly`, and on which trajectory."""
-
-    name: str
-    title: str
-    truth: tuple[str, ...] = ()
-    trajectory: tuple[str, ...] = ("lemniscate", "--set", "speed=3", "--set", "climb=0.8")
-
-    def words(self, seed: int) -> list[str]:
-        """The words for `sim-bridge fly` with this seed."""
-        drawn = ["--set", f"seed={UNSEEN + seed}"] if self.trajectory[0] == "scenario" else []
-        return ["--trajectory", *self.trajectory, *drawn, *self.truth]
-
-
-_SLEEK = ("--hidden", "rotor_drag:0.15", "--hidden", "parasitic_drag:0.018")
-"""Drag as Neural-Fly's vehicle has it. In the flights that its authors published (`custom_figure8_baseline_*`) it tilts
-by 0.12, 0.25, 0.50 rad on average in 4.2, 8.5, 12.1 m/s; with these numbers the vehicle here by 0.14, 0.31, 0.50. With
-the drag of `rich` it would need 0.73 to 0.78 rad at 12.1 m/s, which is beyond every controller's limit of 0.7."""
-
-
-def _eight(wind: float) -> Disturbance:
-    hidden = ("--hidden", f"wind:{wind:g}") if wind else ()
-    return Disturbance(
-        f"eight-{wind:g}",
-        f"Neural-Fly's figure eight, and its vehicle's drag, in a wind of {wind:g} m/s",
-        (*_CHARGE, *_SLEEK, *hidden),
-        ("vertical_eight",),
-    )
-
-
-DISTURBANCES = (
-    Disturbance("none", "the vehicle's own truth alone", _CHARGE),
-    Disturbance("steps", "steps and translations, own truth", _CHARGE, ("scenario", "--set", "speed=3")),
-    Disturbance("wind", "steady wind of 3 m/s", (*_CHARGE, "--hidden", "wind:3")),
-    Disturbance("payload", "12 % of the mass carried", (*_CHARGE, "--hidden", "payload:0.12")),
-    Disturbance("uncertainty", "thrust 15 % lower than believed", (*_CHARGE, "--hidden", "thrust_gain:0.85")),
-    Disturbance(
-        "rotor", "one rotor loses 15 % of its thrust after 6 s", (*_CHARGE, "--hidden", "rotor_damage:0.15@6")
-    ),
-    Disturbance("torque", "centre of mass 8 mm off", (*_CHARGE, "--hidden", "com_offset:0.008")),
-    Disturbance("old", "battery of 1.5 times the resistance", (*_CHARGE, "--battery-age", "1.5")),
-    *(_eight(wind) for wind in (0.0, 4.2, 8.5, 12.1)),
-)
 EFFECTS_ALONE = "corrected, effects"
 """The corrected controller with the effects alone; `corrected` has the network beside them."""
+IN_PROCESS, COMPANION = "in-process", "companion"
+FINISHED = "finished"
+HEADLINE = ("none", "wind", "payload", "old")
+HEADLINE_CONTROLLERS = (LQR, INDI, CORRECTED)
+"""What is flown through the real companion as well."""
+AT_ONCE = 64
+"""Flights that one program flies, after which what they gave is kept."""
+EXCEEDED = 0.95
+"""Of the time: the tilt and the thrust that are told were exceeded in the rest of it."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One flight: RMSE (m, over three axes) to the `reference` and the `linear` behaviour, and how it ended; NaN where
-    that was early."""
+    """One flight: RMSE (m, over three axes) to the `reference` and the `linear` behaviour, and how it ended; `tilt`
+    (rad) and `thrust` (normalised command) were exceeded in a twentieth of it. NaN where it ended early."""
 
     seed: int
     disturbance: str
@@ -91,15 +61,9 @@ class Cell:
     reference: float
     linear: float
     outcome: str
-
-
-def chosen_disturbances(names: Sequence[str] | None) -> list[Disturbance]:
-    """Those of these names, all where none is named; raises `InputError` for a name that is none."""
-    known = {one.name: one for one in DISTURBANCES}
-    for name in names or ():
-        if name not in known:
-            raise InputError(f"--disturbance {name}: unknown; choose from {', '.join(known)}")
-    return [known[name] for name in dict.fromkeys(names or known)]
+    tilt: float
+    thrust: float
+    through: str = IN_PROCESS
 
 
 def chosen_controllers(names: Sequence[str] | None) -> list[str]:
@@ -111,6 +75,23 @@ def chosen_controllers(names: Sequence[str] | None) -> list[str]:
     return list(dict.fromkeys(names or every))
 
 
+def learns(name: str) -> bool:
+    """Whether a controller flies with a model of the vehicle."""
+    return name in (CORRECTED, EFFECTS_ALONE)
+
+
+def prepared_for(
+    asked: Asked, seed: int, names: Iterable[str], tell: Callable[[str, int], None]
+) -> Prepared | None:
+    """What the vehicle of `seed` has taught, where one of these controllers needs it."""
+    folder = asked.folder / f"vehicle-{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    if not any(map(learns, names)):
+        return None
+    tell(f"vehicle {seed}: learn", 0)
+    return prepare(folder, asked.vehicle, seed, asked.truth, asked.minutes, lambda what: None)
+
+
 def compare(
     asked: Asked,
     seeds: Sequence[int],
@@ -120,61 +101,153 @@ def compare(
     tell: Callable[[str, int], None],
 ) -> list[Cell]:
     """Prepare a vehicle for each seed, where a controller needs a model, and fly everything; what the folder holds is
-    kept. `tell` is called with what is done now, and how many pieces are done with it."""
+    kept. `tell` is called with what is done now, and how many flights are done with it."""
     cells: list[Cell] = []
     for seed in seeds:
+        prepared = prepared_for(asked, seed, names, tell)
         folder = asked.folder / f"vehicle-{seed}"
-        folder.mkdir(parents=True, exist_ok=True)
-        prepared = None
-        if any(name in (CORRECTED, EFFECTS_ALONE) for name in names):
-            tell(f"vehicle {seed}: learn", 0)
-            prepared = prepare(folder, asked.vehicle, seed, asked.truth, asked.minutes, lambda what: None)
-        tell(f"vehicle {seed}: fly", 0)
-
-        def one(
-            task: tuple[Disturbance, str], seed: int = seed, prepared: Prepared | None = prepared
-        ) -> Cell:
-            cell = _flown(asked, seed, prepared, *task)
-            tell(f"vehicle {seed}: fly", 1)
-            return cell
-
-        with ThreadPoolExecutor(jobs) as pool:
-            cells += pool.map(one, [(d, name) for d in disturbances for name in names])
+        tasks = [(one, name) for one in disturbances for name in names]
+        known = {task: _known(_kept(folder, task[0].name, task[1])) for task in tasks}
+        missing = [task for task in tasks if known[task] is None]
+        tell(f"vehicle {seed}: fly", len(tasks) - len(missing))
+        for start in range(0, len(missing), AT_ONCE):
+            here = missing[start : start + AT_ONCE]
+            known |= zip(here, _fly(asked, seed, prepared, here, jobs), strict=True)
+            tell(f"vehicle {seed}: fly", len(here))
+        cells += [cell for task in tasks if (cell := known[task]) is not None]
     return cells
 
 
-def _flown(asked: Asked, seed: int, prepared: Prepared | None, disturbance: Disturbance, name: str) -> Cell:
-    stem = f"controllers-{disturbance.name}-{name.replace(', ', '-')}"
-    kept = asked.folder / f"vehicle-{seed}" / f"{stem}.json"
-    if kept.is_file():
-        try:
-            return Cell(
-                **json_object(read_text(kept, "a flight", "it is flown again"), str(kept), "flown again")
-            )
-        except (InputError, TypeError):  # damaged, or of another version: fly again
-            pass
-    record = kept.with_suffix(".mcap")
-    record.unlink(missing_ok=True)
-    command: list[object] = ["sim-bridge", "fly", "--vehicle", asked.vehicle, *asked.truth, "--seed", seed]
-    command += [*disturbance.words(seed), "--settle", SETTLE, "-o", record, "--json"]
-    if name in (CORRECTED, EFFECTS_ALONE):
-        assert prepared is not None
-        command += [
-            "--controller",
-            CORRECTED,
-            "--model",
-            prepared.files[BOTH if name == CORRECTED else EFFECTS],
-        ]
-    else:
-        command += ["--controller", name]
-    report = run_json(command)
-    reference = linear = math.nan
-    if report["outcome"] == "finished":
-        tracked = track_file(record)
-        off = np.linalg.norm(tracked.position - tracked.reference, axis=1)
-        reference, linear = float(np.sqrt(np.mean(off**2))), tracked.rms
-    cell = Cell(seed, disturbance.name, name, reference, linear, report["outcome"])
-    write_whole(kept, json.dumps(asdict(cell)), "what was flown")
-    record.unlink()
-    record.with_suffix(".sealed").unlink(missing_ok=True)  # the simulator's answer is not looked at here
-    return cell
+def compare_for_real(
+    asked: Asked, seed: int, disturbances: Sequence[Disturbance], tell: Callable[[str, int], None]
+) -> list[Cell]:
+    """The headline rows through the real companion over MAVLink, in real time: a fresh battery, bridge and companion
+    for each flight."""
+    prepared = prepared_for(asked, seed, HEADLINE_CONTROLLERS, tell)
+    folder, cells = asked.folder / f"vehicle-{seed}", []
+    tell(f"vehicle {seed}: fly with the companion", 0)
+    for one in (d for d in disturbances if d.name in HEADLINE):
+        for name in HEADLINE_CONTROLLERS:
+            kept = _kept(folder, f"companion-{one.name}", name)
+            cell = _known(kept)
+            if cell is None:
+                entry, record = through_companion(
+                    kept.with_suffix(""),
+                    asked.vehicle,
+                    _words(asked, seed, one),
+                    {
+                        "trajectory": one.trajectory,
+                        "parameters": one.settings(seed),
+                        "controller": _controller(name),
+                        "repeat": 1,
+                    },
+                    _model(prepared, name),
+                )
+                cell = _cell(seed, one.name, name, record, entry["state"], COMPANION)
+                write_whole(kept, json.dumps(asdict(cell)), "what was flown")
+            cells.append(cell)
+            tell(f"vehicle {seed}: fly with the companion", 1)
+    return cells
+
+
+def fly_table(
+    asked: Asked, rows: Sequence[dict[str, object]], folder: Path, jobs: int
+) -> dict[str, dict[str, Any]]:
+    """Fly the rows of a table (`sim-bridge fly-many --flights`) into `folder`: its report of each, by name."""
+    if not rows:
+        return {}
+    out = io.StringIO()
+    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    table = folder / "flights.csv"
+    for row in rows:  # of a run that was killed
+        (folder / f"{row['name']}.mcap").unlink(missing_ok=True)
+    write_whole(table, out.getvalue(), "the table of flights")
+    words: list[object] = ["sim-bridge", "fly-many", "--flights", table, "--vehicle", asked.vehicle]
+    words += ["--settle", SETTLE, "--jobs", jobs, "--tell-hidden", "-o", folder, "--json"]
+    reports = {report["name"]: report for report in run_json(words)["flights"]}
+    table.unlink()
+    return reports
+
+
+def row_of(
+    asked: Asked, seed: int, prepared: Prepared | None, disturbance: Disturbance, name: str, stem: str
+) -> dict[str, object]:
+    """One flight as a row of the table of `fly_table`; its record is named `stem`."""
+    return {
+        "name": stem,
+        "seed": seed,
+        "trajectory": disturbance.trajectory,
+        "set": ";".join(f"{key}={value:g}" for key, value in disturbance.settings(seed).items()),
+        "hidden": ";".join((*asked.hidden, *disturbance.hidden)),
+        "charge": CHARGE,
+        "battery_age": disturbance.battery_age,
+        "controller": _controller(name),
+        "model": _model(prepared, name) or "",
+    }
+
+
+def _controller(name: str) -> str:
+    return CORRECTED if name == EFFECTS_ALONE else name
+
+
+def _model(prepared: Prepared | None, name: str) -> Path | None:
+    if not learns(name):
+        return None
+    assert prepared is not None
+    return prepared.files[EFFECTS if name == EFFECTS_ALONE else BOTH].resolve()
+
+
+def _words(asked: Asked, seed: int, disturbance: Disturbance) -> list[str]:
+    """For `sim-bridge run`."""
+    hidden = [word for name in disturbance.hidden for word in ("--hidden", name)]
+    words = [*asked.truth, *hidden, "--seed", str(seed), "--charge", str(CHARGE)]
+    return [*words, "--battery-age", str(disturbance.battery_age)]
+
+
+def _kept(folder: Path, flight: str, name: str) -> Path:
+    return folder / f"controllers-{flight}-{name.replace(', ', '-')}.json"
+
+
+def _known(kept: Path) -> Cell | None:
+    """What an earlier run kept of a flight; None where there is nothing, or of another version: it is flown again."""
+    if not kept.is_file():
+        return None
+    try:
+        return Cell(**json_object(read_text(kept, "a flight", "it is flown again"), str(kept), "flown again"))
+    except (InputError, TypeError):
+        return None
+
+
+def _fly(
+    asked: Asked, seed: int, prepared: Prepared | None, tasks: Sequence[tuple[Disturbance, str]], jobs: int
+) -> list[Cell]:
+    folder, cells = asked.folder / f"vehicle-{seed}", []
+    stems = [_kept(folder, one.name, name).stem for one, name in tasks]
+    rows = [row_of(asked, seed, prepared, *task, stem) for task, stem in zip(tasks, stems, strict=True)]
+    reports = fly_table(asked, rows, folder, jobs)
+    for (one, name), stem in zip(tasks, stems, strict=True):
+        record = folder / f"{stem}.mcap"
+        cell = _cell(seed, one.name, name, record, reports[stem]["outcome"], IN_PROCESS)
+        write_whole(_kept(folder, one.name, name), json.dumps(asdict(cell)), "what was flown")
+        record.unlink()
+        cells.append(cell)
+    return cells
+
+
+def _cell(seed: int, disturbance: str, name: str, record: Path, outcome: str, through: str) -> Cell:
+    if outcome != FINISHED:  # the record may be too short to be read as a flight
+        return Cell(seed, disturbance, name, math.nan, math.nan, outcome, math.nan, math.nan, through)
+    flight, design, _ = read_designed(record)
+    tracked = track(flight, design)
+    off = np.linalg.norm(tracked.position - tracked.reference, axis=1)
+    reference = float(np.sqrt(np.mean(off**2)))
+    return Cell(seed, disturbance, name, reference, tracked.rms, outcome, *_worked(flight), through)
+
+
+def _worked(flight: Flight) -> tuple[float, float]:
+    """Tilt (rad) and thrust command that were exceeded in a twentieth of a flight."""
+    upright = rotation_matrix(flight.column("quaternion"))[:, 2, 2]
+    tilt = np.arccos(np.clip(upright, -1.0, 1.0))
+    return float(np.quantile(tilt, EXCEEDED)), float(np.quantile(flight.column("thrust_command"), EXCEEDED))

@@ -440,10 +440,6 @@ def fly_companion(
 def _fly_companion(
     vehicle: Path, prepared: Prepared, truth: Sequence[str], scenario: Scenario, arm: Arm, rig: Path
 ) -> Flown:
-    from trueflight.groundstation.operate.link import Link
-    from trueflight.groundstation.operate.settings import Settings
-
-    rig.mkdir(exist_ok=True)
     words = [*truth, "--seed", str(prepared.seed), *scenario.truth]
     mission = {
         "trajectory": scenario.trajectory,
@@ -451,20 +447,12 @@ def _fly_companion(
         "controller": arm.controller,
         "repeat": 1,
     }
-    name = load_vehicle(vehicle).name
-    with (
-        running_rig(rig, vehicle, words) as (endpoint, _),
-        Link(Settings(connect=(endpoint,), name=name)) as link,
-    ):
-        if arm.model:
-            link.request("model", prepared.files[arm.model].read_bytes(), 60.0)
-        answer = link.request("mission", mission, 30.0)
-        entry = link.end_of(answer["mission"])
-        if entry["state"] != "finished":
-            raise InputError(
-                f"{rig.name}, seed {prepared.seed}: {entry['state']}: {entry['reason']}; see {rig / 'companion.log'}"
-            )
-        record = link.fetch_record(entry["record"], rig)
+    model = prepared.files[arm.model] if arm.model else None
+    entry, record = through_companion(rig, vehicle, words, mission, model)
+    if entry["state"] != "finished":
+        raise InputError(
+            f"{rig.name}, seed {prepared.seed}: {entry['state']}: {entry['reason']}; see {rig / 'companion.log'}"
+        )
     guard = ""
     if arm.model:
         from trueflight.models.record import read_record
@@ -474,6 +462,27 @@ def _fly_companion(
     return Flown(
         prepared.seed, scenario.name, arm.name, track_file(record).mse, "finished", guard, "companion"
     )
+
+
+def through_companion(
+    rig: Path, vehicle: Path, words: Sequence[str], mission: dict[str, Any], model: Path | None
+) -> tuple[dict[str, Any], Path]:
+    """Fly one mission in real time, by a bridge (`words` for `sim-bridge run`) and a companion of its own in the folder
+    `rig`: the companion's entry of the mission, and its record."""
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.settings import Settings
+
+    rig.mkdir(exist_ok=True)
+    name = load_vehicle(vehicle).name
+    with (
+        running_rig(rig, vehicle, words) as (endpoint, _),
+        Link(Settings(connect=(endpoint,), name=name)) as link,
+    ):
+        if model is not None:
+            link.request("model", model.read_bytes(), 60.0)
+        answer = link.request("mission", mission, 30.0)
+        entry = link.end_of(answer["mission"])
+        return entry, link.fetch_record(entry["record"], rig)
 
 
 def chosen_scenarios(names: Sequence[str] | None) -> list[Scenario]:

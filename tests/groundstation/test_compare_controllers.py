@@ -1,14 +1,17 @@
 """Controllers beside each other: flown by the real program, in both measures, kept, and refused by name."""
 
 import json
-from itertools import pairwise
 from pathlib import Path
 
 import programs
 import pytest
 from json_schemas import valid
 
-from trueflight.groundstation.study.controllers import DISTURBANCES, Cell, chosen_controllers
+from trueflight.groundstation.study import margins as margins_module
+from trueflight.groundstation.study.controllers import Cell, chosen_controllers
+from trueflight.groundstation.study.disturbances import DISTURBANCES, LIMITS, Disturbance
+from trueflight.groundstation.study.margins import ROUNDS, Margin, find_margins
+from trueflight.groundstation.study.reproduce import Asked
 from trueflight.models.contract import CONTROLLERS
 from trueflight.models.shipped import QUAD5
 from trueflight.models.vehicle import load_vehicle
@@ -52,6 +55,22 @@ def test_flight_that_is_lost_at_once_is_told_and_has_no_figures(tmp_path: Path) 
     assert "lost" in programs.run("groundstation", *words, cwd=tmp_path).stdout
 
 
+def test_margins_are_found_kept_and_told_with_their_limits(tmp_path: Path, monkeypatch) -> None:
+    told: list[int] = []
+    asked = Asked(tmp_path, QUAD5, ("rotor_drag:0.3",), 5.0)
+    limits = [limit for limit in LIMITS if limit.name == "delay"]
+
+    def found() -> list[Margin]:
+        return find_margins(asked, [1], limits, ["lqr"], 1, lambda what, done: told.append(done))
+
+    first = found()
+    assert sum(told) == ROUNDS
+    assert first[0].size is not None and 0.05 < first[0].size < 0.32 and not first[0].beyond
+    assert [path.name for path in (tmp_path / "vehicle-1").iterdir()] == ["margins.json"]
+    monkeypatch.setattr(margins_module, "fly_table", None)  # nothing is flown again
+    assert found() == first
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
@@ -65,13 +84,14 @@ def test_unknown_names_are_refused_in_one_line_and_nothing_is_made(words, told: 
     assert not (tmp_path / "study").exists()
 
 
-def test_simulator_knows_every_disturbance() -> None:
+@pytest.mark.parametrize(
+    "one", [*DISTURBANCES, *(limit.at(size) for limit in LIMITS for size in (limit.least, limit.most))]
+)
+def test_simulator_knows_every_disturbance(one: Disturbance) -> None:
     vehicle = load_vehicle(QUAD5)
-    for one in DISTURBANCES:
-        hidden = [word for before, word in pairwise(one.truth) if before == "--hidden"]
-        assert len(choose(hidden or ["none"], vehicle, 1)) == len(hidden), one.name
-        assignments = [word for before, word in pairwise(one.trajectory) if before == "--set"]
-        assert trajectory_of(one.trajectory[0], assignments).duration > 10.0
+    assert len(choose(list(one.hidden) or ["none"], vehicle, 1)) == len(one.hidden)
+    settings = [f"{key}={value:g}" for key, value in one.settings(1).items()]
+    assert trajectory_of(one.trajectory, settings).duration > 10.0
 
 
 def test_every_controller_is_flown_unless_some_are_named() -> None:
