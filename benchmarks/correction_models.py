@@ -54,7 +54,10 @@ def _network(flight: Flight) -> Network:
         for a, b in pairwise(sizes)
     )
     scale = np.full(3, 0.2, dtype=np.float32)
-    return Network(names, 0.5 * (low + high), 0.5 * (high - low), layers, scale, low, high, flight.data_hash)
+    return Network(
+        names, 0.5 * (low + high), 0.5 * (high - low), layers, scale, low, high, flight.data_hash,
+        margin=0.5 * (high - low),
+    )  # fmt: skip
 
 
 def correction_models(folder: Path) -> dict[str, bytes]:
