@@ -14,12 +14,14 @@ from typing import Any
 
 from trueflight.companion.flight import FlightStateMachine
 from trueflight.companion.law.guard import Guard
+from trueflight.companion.law.inference import cannot_learn
 from trueflight.companion.law.watch import GuardLimits
 from trueflight.companion.mission import Mission
 from trueflight.companion.outcome import IDLE
 from trueflight.companion.shadow import Shadow, ShadowLimits
 from trueflight.companion.store import ModelStore
 from trueflight.companion.succession import Decision
+from trueflight.models.contract import CORRECTED, CORRECTED_ADAPTIVE
 from trueflight.models.errors import InputError
 
 ORDER_TIMEOUT = 0.2
@@ -113,16 +115,22 @@ class Deployment:
 
     # Around a flight, on the main thread
 
-    def guard(self) -> Guard | None:
-        """A guard around the live model, or around none where one is staged; None where there is neither."""
-        model = self.store.live
+    def guard(self, controller: str = CORRECTED) -> Guard | None:
+        """A guard around the live model, or around none where one is staged; None where there is neither.
+
+        For `corrected_adaptive` the model learns; raises `InputError` where the one that will fly cannot.
+        """
+        model, learns = self.store.live, controller == CORRECTED_ADAPTIVE
+        flies = self.store.open(self.store.staged_name) if self.store.staged_name else model
+        if learns and flies is not None and not flies.info.learnables:
+            raise InputError(cannot_learn(flies.info.name))
         if model is None and not self.store.staged_name:
             return None
 
         def tripped(name: str, reason: str) -> None:
             self._emit("warning", "guard_trip", f"correction {name} switched off: {reason}")
 
-        watch = model.watched(self._guard_limits) if model is not None else None
+        watch = model.watched(self._guard_limits, learns) if model is not None else None
         return Guard(watch, tripped, self._guard_limits)
 
     def prepare(self, mission: Mission) -> tuple[Mission, str]:
@@ -132,7 +140,10 @@ class Deployment:
         """
         with self._lock:
             if mission.guard is not None:
-                guard = self.guard()
+                try:
+                    guard = self.guard(mission.controller)
+                except InputError as error:
+                    return mission, str(error)
                 if guard is None:
                     return mission, "no model is live any more; deploy one"
                 staged = self.store.staged_name
@@ -159,6 +170,12 @@ class Deployment:
             self._keep(models.decisions.popleft())
         models.live = self.store.live_name
 
+    @property
+    def _learns(self) -> bool:
+        """Whether models learn in the flight under way."""
+        mission = self._flight.mission
+        return mission is not None and mission.controller == CORRECTED_ADAPTIVE
+
     def _accepted(self, reason: str, **more: str) -> dict[str, Any]:
         return {"accepted": True, **more, "reason": reason, **self.store.describe()}
 
@@ -171,7 +188,7 @@ class Deployment:
             return {"accepted": False, "reason": str(error)}
         answer = self.store.roll_back()
         if answer["accepted"]:
-            watch = earlier_model.watched(self._guard_limits) if earlier_model else None
+            watch = earlier_model.watched(self._guard_limits, self._learns) if earlier_model else None
             self._flight.roll_back(watch)
             self._flight.models.live = self.store.live_name
             self._emit("info", "model_rolled_back", f"by command: {answer['reason']}")
@@ -180,7 +197,7 @@ class Deployment:
     def _try(self, name: str, seconds: float | None = None) -> str:
         """Put the staged model into the shadow of the flight; '' or why not."""
         try:
-            watch = self.store.open(name).watched(self._guard_limits)
+            watch = self.store.open(name).watched(self._guard_limits, self._learns)
         except InputError as error:
             self.store.discard(name)
             return str(error)

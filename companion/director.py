@@ -22,7 +22,7 @@ from trueflight.companion.records import Records
 from trueflight.companion.sortie import Progress, Sortie
 from trueflight.companion.stopping import Safety
 from trueflight.companion.vehicle_link import VehicleLink
-from trueflight.models.contract import CORRECTED
+from trueflight.models.contract import WITH_MODEL
 from trueflight.models.errors import InputError, shown
 
 QUEUE_LIMIT = 16
@@ -125,7 +125,7 @@ class Director:
             if len(self._queue) >= QUEUE_LIMIT:
                 raise InputError(f"{QUEUE_LIMIT} missions are waiting already")
             self._number += 1
-            guard = self._deployment.guard() if controller == CORRECTED else None
+            guard = self._deployment.guard(controller) if controller in WITH_MODEL else None
             mission = Mission(f"m{self._number}", path, controller, repeat, guard)
             progress = Progress(mission)
             self._known[mission.identity] = progress

@@ -263,6 +263,7 @@ class FlightStateMachine:
         out.step = controller.step(state, self._course.preview, out.interval)
         if guard is not None:
             out.guard, out.inference = guard.status, guard.inference_time
+            out.learning = guard.learning.told if guard.learning is not None else None
 
     def _reference(self, mission: Mission, odometry: Odometry, out: Outcome) -> ReferenceSample:
         course, guard = self._course, mission.guard

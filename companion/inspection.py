@@ -88,9 +88,11 @@ def _ask_child(files: Sequence[bytes], vehicle: Vehicle, deadline: float) -> tup
 def _finding(answer: dict[str, Any]) -> Finding:
     from trueflight.companion.law.actuation import Actuation
     from trueflight.companion.law.inference import ModelInfo, Range
+    from trueflight.models.learnable import Learnable
 
     info = answer["info"]
     if info is not None:
+        x, y, z = info["noise"]
         info = ModelInfo(
             str(info["hash"]),
             str(info["name"]),
@@ -99,6 +101,8 @@ def _finding(answer: dict[str, Any]) -> Finding:
             tuple(info["chain"]),
             str(info["data_hash"]),
             Actuation(*(float(number) for number in info["actuation"])),
+            tuple(Learnable(**one) for one in info["learnables"]),
+            (float(x), float(y), float(z)),
         )
     return Finding(
         bool(answer["accepted"]) and info is not None,
@@ -165,6 +169,8 @@ def _answer(verdict: Verdict) -> dict[str, Any]:
             "chain": info.chain,
             "data_hash": info.data_hash,
             "actuation": astuple(info.actuation),
+            "learnables": [one.table() for one in info.learnables],
+            "noise": info.noise,
         },
     }
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from trueflight.companion.law.guard import Guard
 from trueflight.companion.outcome import LANDING, MISSION, TAKEOFF
 from trueflight.companion.stopping import Safety
-from trueflight.models.contract import CORRECTED
+from trueflight.models.contract import WITH_MODEL
 from trueflight.models.controllers import check_controller
 from trueflight.models.errors import InputError
 from trueflight.models.reference import Trajectory, transfer
@@ -40,8 +40,8 @@ class Mission:
 
     def __post_init__(self) -> None:
         check_controller(self.controller)
-        if (self.guard is None) != (self.controller != CORRECTED):
-            raise InputError("controller 'corrected' needs a deployed model")
+        if (self.guard is None) != (self.controller not in WITH_MODEL):
+            raise InputError(f"controller '{self.controller}' needs a deployed model")
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from trueflight.companion.law.adaptation import Told
 from trueflight.companion.law.control import ControlStep
 from trueflight.models.trajectory import ReferenceSample
 
@@ -18,7 +19,7 @@ class Outcome:
 
     `model` is the live one's hash, whether it acts or not; `shadow` that of the model in the shadow, and
     `shadow_raw` what it returned (m/s², heading frame). `age` in s: from the moment of the odometry, by the vehicle's
-    clock, to the answer.
+    clock, to the answer. `learning` is what the live model learns in this flight, as it is now.
     """
 
     phase: str
@@ -34,3 +35,4 @@ class Outcome:
     shadow: str = ""
     shadow_raw: Vector = (0.0, 0.0, 0.0)
     age: float = 0.0
+    learning: Told | None = None

@@ -7,13 +7,20 @@ import hashlib
 CONTRACT_VERSION = "1"
 
 LQR, LQR_INTEGRAL, CORRECTED = "lqr", "lqr_integral", "corrected"
+CORRECTED_ADAPTIVE = "corrected_adaptive"
+"""`corrected`, with a model whose numbers are learnt anew while it flies."""
+WITH_MODEL = (CORRECTED, CORRECTED_ADAPTIVE)
+"""Controllers that fly with a deployed model."""
 INDI, L1_ADAPTIVE, GEOMETRIC, PX4_CASCADE = "indi", "l1_adaptive", "geometric", "px4_cascade"
-CONTROLLERS = (LQR, LQR_INTEGRAL, CORRECTED, INDI, L1_ADAPTIVE, GEOMETRIC, PX4_CASCADE)
+CONTROLLERS = (LQR, LQR_INTEGRAL, CORRECTED, CORRECTED_ADAPTIVE, INDI, L1_ADAPTIVE, GEOMETRIC, PX4_CASCADE)
 """What a mission can be flown with: the cascade, the cascade with an integral, the cascade with its correction; to be
 compared with them, controllers after other papers. `models.controllers` has those of installed packages beside them."""
 
 INPUT_NAME, OUTPUT_NAME = "features", "delta"
 """float32 [N, F] in, float32 [N, 3] out: error acceleration in m/s², heading frame."""
+PARAMETERS_NAME, SENSITIVITY_NAME = "parameters", "sensitivity"
+"""Of a model that learns in flight: float32 [N, P] in, beside the features; float32 [N, 3 P] out: the derivative of the
+three accelerations along the first parameter, then along the second, and so on."""
 
 FEATURES: dict[str, str] = {
     "z": "m",
@@ -57,6 +64,12 @@ ACTUATION_LIMITS: dict[str, float] = {
     "thrust_lag": 0.15,  # s
 }
 """The greatest value of each number; beyond it no look-ahead can help, and none is accepted."""
+KEY_ADAPTIVE = "adaptive"
+"""Optional: what may be learnt in flight, a list of the fields of `models.learnable.Learnable`, in the order of the
+graph's parameters. With it go the next three keys."""
+KEY_NOISE = "noise"  # [3 floats], m/s²: what the model leaves of the flights it was exported with, low-passed
+KEY_GOLDEN_PARAMETERS = "golden_parameters"  # [[P floats] x as many as golden features]
+KEY_GOLDEN_SENSITIVITY = "golden_sensitivity"  # [[3 P floats] x as many]
 REQUIRED_KEYS = (
     KEY_CONTRACT,
     KEY_NAME,

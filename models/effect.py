@@ -114,6 +114,8 @@ class Parameter:
     are looked at together: the `VEHICLE`'s, the same in all of them, or each `FLIGHT`'s own. `grows` and `shrinks` say
     in words that a vehicle's number is not what it was, with a place for the difference: "rotor 3 has lost {:.0%}".
     `rotor` is the number of the rotor that it belongs to, from 1: a vehicle with fewer does not have it.
+    `drifts` is the share of `typical` by which it may change within ten seconds of flight: 1 for what happens at once
+    (a payload picked up, a gust), less for what wears, 0 for what stays. Those are learnt in flight.
 
     Raises `ValueError` for any other owner.
     """
@@ -134,6 +136,7 @@ class Parameter:
     belongs_to: str = VEHICLE
     grows: str = ""
     shrinks: str = ""
+    drifts: float = 0.0
 
     def __post_init__(self) -> None:
         if self.belongs_to not in (VEHICLE, FLIGHT):
@@ -172,6 +175,9 @@ class Effect:
     between command and rotors, with `scales_rotors` effects fitted beside them: no vehicle file tells what thrust a
     rotor speed gives.
 
+    `learnt_unasked` effects are learnt in flight even by a model that lacks them, from where they do nothing: what may
+    happen to any vehicle (a payload, a gust).
+
     For studies of known truth: `shown_in` is the one kind of flight that shows it, `DESCENT` or `BELOW_CEILING`;
     `truth_for` gives the true values of the parameters by the simulator's numbers and the neutral values, where a
     parameter's own `truth` is not enough; `carrier_truth` is the simulator's number for every parameter of the first of
@@ -208,6 +214,7 @@ class Effect:
     shifts_clock: bool = False
     before_rotors: bool = False
     scales_rotors: bool = False
+    learnt_unasked: bool = False
     shown_in: str = ""
     truth_for: Callable[[Mapping[str, float], Mapping[str, float]], Mapping[str, float]] | None = None
     carrier_truth: str = ""

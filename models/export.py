@@ -14,17 +14,31 @@ import numpy as np
 import onnx
 import torch
 
-from trueflight.models import contract
+from trueflight.models import contract, dual
+from trueflight.models.adaptive import adaptive as with_learnables
 from trueflight.models.effect import Stage
 from trueflight.models.export_graph import simplify
 from trueflight.models.features import feature_matrix, feature_names, features_of_flight
 from trueflight.models.flight import Flight
+from trueflight.models.lag import lagged
+from trueflight.models.learnable import Learnable
 from trueflight.models.model import Model
 from trueflight.models.network import Network, folded_layers
-from trueflight.models.prediction import error_acceleration, motion_of_features
+from trueflight.models.prediction import (
+    apply_effects,
+    error_acceleration,
+    motion_of_features,
+    motion_of_flight,
+    specific_force,
+)
 
 GOLDEN = 8
 """Golden vectors in each file."""
+SMOOTHING = 0.2
+"""s: time constant of the low-pass behind which the noise of an adaptive model is told, as a shadow's
+(`companion.shadow`)."""
+LEAST_NOISE = 0.03
+"""m/s²: below it no model is believed to be, and what says so has been fitted to its own noise."""
 
 
 class Correction(torch.nn.Module):
@@ -53,6 +67,42 @@ class Correction(torch.nn.Module):
         columns = {name: features[:, i] for i, name in enumerate(self.names)}
         known: Any = error_acceleration(motion_of_features(columns, self.vehicle), self.chain)
         return known if learnt is None else known + learnt
+
+
+class Adaptive(Correction):
+    """`delta` (N, 3) of features (N, F) and parameters (N, P), and its derivative along each parameter (N, 3 P): the
+    effects' own formulas, differentiated as they stand."""
+
+    def __init__(self, model: Model, names: tuple[str, ...], learnables: Sequence[Learnable]) -> None:
+        super().__init__(model, names)
+        self.learnables = tuple(learnables)
+
+    def forward(  # type: ignore[override]
+        self, features: torch.Tensor, parameters: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Error acceleration of each row, and its derivatives."""
+        free = dict(
+            zip(
+                [(one.effect, one.parameter) for one in self.learnables],
+                dual.parameters([parameters[:, k] for k in range(len(self.learnables))]),
+                strict=True,
+            )
+        )
+        chain = [
+            (effect, {name: free.get((effect.name, name), value) for name, value in values.items()})
+            for effect, values in self.chain
+        ]
+        known: Any = error_acceleration(
+            motion_of_features(
+                {name: dual.fixed(features[:, i], len(free)) for i, name in enumerate(self.names)},
+                self.vehicle,
+            ),
+            chain,
+        )
+        delta = known.value if self.network is None else known.value + self.network(features)
+        nothing = 0.0 * features[:, 0]
+        slopes = [nothing if slope is None else slope[:, axis] for slope in known.slopes for axis in range(3)]
+        return delta, torch.stack(slopes, dim=-1)
 
 
 class Fading(torch.nn.Module):
@@ -99,16 +149,22 @@ def not_exported(model: Model) -> tuple[str, ...]:
     return tuple(e.name for e in held if not e.undone_by_look_ahead)
 
 
-def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] | None = None) -> bytes:
+def export_onnx(
+    model: Model, *flights: Flight, actuation: Mapping[str, float] | None = None, adaptive: bool = False
+) -> bytes:
     """The model as an ONNX file, effects and network in one graph, with golden vectors taken from `flights`.
 
     The range in which the file may be believed is that of `flights`, together with a network's own; beside a network
     that does not fade by itself it is the network's alone. Golden vectors of one that does are in its range, half
     faded and far outside. `actuation` holds what is known of the path from command to motion, by the names of
-    `models.contract.ACTUATION_LIMITS`.
+    `models.contract.ACTUATION_LIMITS`. With `adaptive` numbers of it can be learnt anew in flight (`models.adaptive`).
 
-    Raises `InputError` where a flight lacks position, velocity, attitude or command.
+    Raises `InputError` where a flight lacks position, velocity, attitude or command, and where there is nothing to
+    learn.
     """
+    learnables: tuple[Learnable, ...] = ()
+    if adaptive:
+        model, learnables = with_learnables(model)
     names = feature_names(model)
     table = np.concatenate(
         [
@@ -116,12 +172,17 @@ def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] |
             for f in flights
         ]
     )
-    module = Correction(model, names).eval()
-    given = table[np.linspace(0, len(table) - 1, GOLDEN).astype(int)]
+    rows = table[np.linspace(0, len(table) - 1, GOLDEN).astype(int)]
     if model.network is not None and model.network.margin is not None:
-        given = np.concatenate([given, _outside(model.network, names, given[0])])
+        rows = np.concatenate([rows, _outside(model.network, names, rows[0])])
+    module = Adaptive(model, names, learnables) if adaptive else Correction(model, names)
+    module.eval()
+    given = [torch.from_numpy(rows)]
+    if adaptive:
+        given.append(torch.from_numpy(_golden_parameters(learnables, len(rows))))
     with torch.no_grad():
-        golden = module(torch.from_numpy(given)).numpy()
+        answered = module(*given)
+    golden = (answered[0] if adaptive else answered).numpy()
     units = {**contract.FEATURES, **contract.YAW_FEATURES}
     low, high = _believed(model, names, table)
     data_hash = model.data_hash or "+".join(f.data_hash for f in flights)
@@ -157,12 +218,19 @@ def export_onnx(model: Model, *flights: Flight, actuation: Mapping[str, float] |
         ),
         contract.KEY_CHAIN: json.dumps(links),
         contract.KEY_DATA_HASH: data_hash,
-        contract.KEY_GOLDEN_FEATURES: json.dumps(given.tolist()),
+        contract.KEY_GOLDEN_FEATURES: json.dumps(rows.tolist()),
         contract.KEY_GOLDEN_DELTA: json.dumps(golden.tolist()),
     }
     if actuation:
         metadata[contract.KEY_ACTUATION] = json.dumps(dict(actuation))
-    return _with_metadata(_graph(module, table[: max(2, GOLDEN)]), metadata)
+    if adaptive:
+        metadata |= {
+            contract.KEY_ADAPTIVE: json.dumps([one.table() for one in learnables]),
+            contract.KEY_NOISE: json.dumps(_noise(model, flights)),
+            contract.KEY_GOLDEN_PARAMETERS: json.dumps(given[1].tolist()),
+            contract.KEY_GOLDEN_SENSITIVITY: json.dumps(answered[1].tolist()),
+        }
+    return _with_metadata(_graph(module, given), metadata)
 
 
 def _believed(
@@ -193,22 +261,50 @@ def _outside(network: Network, names: tuple[str, ...], row: np.ndarray) -> np.nd
     return rows
 
 
-def _graph(module: torch.nn.Module, example: np.ndarray) -> onnx.ModelProto:
+def _golden_parameters(learnables: Sequence[Learnable], count: int) -> np.ndarray:
+    """Parameters (`count`, P) at which the golden vectors are evaluated: as deployed in every second row, anywhere in
+    their range in the others."""
+    value, low, high = (np.array([getattr(one, k) for one in learnables]) for k in ("value", "low", "high"))
+    drawn = low + np.random.default_rng(0).uniform(size=(count, len(value))) * (high - low)
+    drawn[::2] = value
+    return drawn.astype(np.float32)
+
+
+def _noise(model: Model, flights: Sequence[Flight]) -> list[float]:
+    """RMS (m/s², three axes of the body) of what the model leaves of the accelerometer's reading, low-passed."""
+    squares, count = np.zeros(3), 0
+    for flight in flights:
+        if flight.specific_force is None:
+            continue
+        predicted = specific_force(apply_effects(motion_of_flight(flight), model.chain()))
+        rows = flight.flying if flight.flying is not None else slice(None)
+        left = (flight.specific_force - predicted)[rows]
+        left = np.stack([lagged(left[:, i], SMOOTHING, flight.dt) for i in range(3)], axis=1)
+        left = left[np.all(np.isfinite(left), axis=1)]
+        squares, count = squares + np.sum(left**2, axis=0), count + len(left)
+    rms = np.sqrt(squares / count) if count else np.zeros(3)
+    return [float(max(LEAST_NOISE, one)) for one in rms]
+
+
+def _graph(module: torch.nn.Module, given: Sequence[torch.Tensor]) -> onnx.ModelProto:
+    ports = [contract.INPUT_NAME, contract.PARAMETERS_NAME][: len(given)]
+    outputs = [contract.OUTPUT_NAME, contract.SENSITIVITY_NAME][: len(given)]
+    batch = torch.export.Dim("N", min=1)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         traced = torch.export.export(
             module,
-            (torch.from_numpy(example),),
-            dynamic_shapes={"features": {0: torch.export.Dim("N", min=1)}},
+            tuple(given),
+            dynamic_shapes={name: {0: batch} for name in ports},
         )
         program = torch.onnx.export(
             simplify(traced),
             (),
             dynamo=True,
             verbose=False,
-            input_names=[contract.INPUT_NAME],
-            output_names=[contract.OUTPUT_NAME],
+            input_names=ports,
+            output_names=outputs,
         )
     assert program is not None
     return program.model_proto

@@ -63,6 +63,20 @@ def _elements(graph: Graph) -> None:
                 done = [_new(graph, node.target, node, column, *pair) for pair in zip(a, b, strict=True)]
                 made = _new(graph, STACK, node, node.meta["val"].shape, done, -1)
             node.replace_all_uses_with(made)
+        elif _is(node, NEG) and _is(node.args[0], STACK) and node.meta["val"].ndim == 2:
+            parts = _columns(node.args[0])
+            assert parts is not None
+            with graph.inserting_before(node):
+                column = node.meta["val"].shape[:1]
+                made = _new(
+                    graph,
+                    STACK,
+                    node,
+                    node.meta["val"].shape,
+                    [_new(graph, NEG, node, column, part) for part in parts],
+                    -1,
+                )
+            node.replace_all_uses_with(made)
 
 
 def _resolve(graph: Graph, node: Any) -> None:

@@ -293,7 +293,9 @@ class FlightRecord:
     `feedback_body_rate` (rad/s), `correction`, `trim`, `correction_raw` (m/s², heading frame), `interval`, `latency`,
     `age`, `inference` (s), `overtaken` (odometry messages), `setpoint_sent`, `armed` (bool) and the words `model`,
     `controller`, `flight_mode`, `phase`, `guard`, `trajectory`, `shadow` (hash of a model evaluated but not applied),
-    with `shadow_raw` (m/s², heading frame) for what that returned. What was never known is absent; what is missing in a
+    with `shadow_raw` (m/s², heading frame) for what that returned; of a model that learns in flight `learning` (what it
+    does now), `learnt_names` (with blanks between) and `learnt`, `learnt_deviation`, `learnt_acting` (N, 8) in that
+    order. What was never known is absent; what is missing in a
     tick is NaN.
     `truncated` tells that the file has no proper end, `notes` what that and any drops mean.
     """

@@ -10,6 +10,7 @@ import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import DecodeError
 
+from trueflight.models.learnable import MOST
 from trueflight.models.message_columns import Columns, leaves
 from trueflight.models.record_pb2 import Tick
 
@@ -31,6 +32,8 @@ VECTORS = (
 )
 """Those of three numbers that may be unknown in a tick."""
 ROTORS = 4
+LEARNT = ("learnt", "learnt_deviation", "learnt_acting")
+"""Those of as many numbers as are learnt in flight, at most `MOST`."""
 ROOM = 1 << 14
 """Ticks that there is room for at least; columns grow by doubling."""
 LEAST = 64
@@ -55,7 +58,7 @@ class TickColumns:
         self._bytes = self._read = 0
         self._room = max(ROOM, size // LEAST)
         self._columns, self._into = _empty(self._room)
-        never_told = (*VECTORS, "rotor_speed")
+        never_told = (*VECTORS, *LEARNT, "rotor_speed")
         unknown = {path: np.nan if path.split(".")[0] in never_told else 0 for path in self._into}
         self._messages = Columns(Tick, unknown)
 
@@ -133,11 +136,14 @@ def _empty(count: int) -> tuple[dict[str, np.ndarray], Mapping[str, np.ndarray]]
     """Columns for so many ticks, and the place in them of every field by its path."""
     columns = {name: _untouched(count, 3) for name in VECTORS}
     columns |= {"quaternion": _untouched(count, 4), "rotor_speed": _untouched(count, ROTORS)}
+    columns |= {name: _untouched(count, MOST) for name in LEARNT}
     columns |= {"feedback_thrust": _untouched(count), "feedback_body_rate": _untouched(count, 3)}
     into: dict[str, np.ndarray] = {"feedback.thrust": columns["feedback_thrust"]}
     into |= {f"feedback.body_rate.{c}": columns["feedback_body_rate"][:, i] for i, c in enumerate("xyz")}
     into |= {f"quaternion.{c}": columns["quaternion"][:, i] for i, c in enumerate("wxyz")}
     into |= {f"rotor_speed.{i}": columns["rotor_speed"][:, i] for i in range(ROTORS)}
+    for name in LEARNT:
+        into |= {f"{name}.{i}": columns[name][:, i] for i in range(MOST)}
     for name in VECTORS:
         into |= {f"{name}.{c}": columns[name][:, i] for i, c in enumerate("xyz")}
     for path, field in leaves(Tick.DESCRIPTOR):
@@ -158,6 +164,7 @@ def _known(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         "position_reference",
         "shadow_raw",
         "trim",
+        *LEARNT,
     ):
         if not np.any(np.isfinite(columns[name])):
             del columns[name]

@@ -37,7 +37,7 @@ class Command(_message.Message):
     def __init__(self, thrust: _Optional[float] = ..., body_rate: _Optional[_Union[Vector3, _Mapping]] = ...) -> None: ...
 
 class Tick(_message.Message):
-    __slots__ = ("vehicle_time_us", "host_time_ns", "position", "velocity", "quaternion", "angular_velocity", "specific_force", "position_reference", "velocity_reference", "acceleration_reference", "yaw_reference", "feedback", "correction", "correction_raw", "thrust_command", "body_rate_command", "battery_voltage", "rotor_speed", "model", "controller", "flight_mode", "armed", "phase", "guard", "interval", "latency", "inference", "setpoint_sent", "trajectory", "shadow", "shadow_raw", "trim", "age", "overtaken")
+    __slots__ = ("vehicle_time_us", "host_time_ns", "position", "velocity", "quaternion", "angular_velocity", "specific_force", "position_reference", "velocity_reference", "acceleration_reference", "yaw_reference", "feedback", "correction", "correction_raw", "thrust_command", "body_rate_command", "battery_voltage", "rotor_speed", "model", "controller", "flight_mode", "armed", "phase", "guard", "interval", "latency", "inference", "setpoint_sent", "trajectory", "shadow", "shadow_raw", "trim", "age", "overtaken", "learning", "learnt_names", "learnt", "learnt_deviation", "learnt_acting")
     VEHICLE_TIME_US_FIELD_NUMBER: _ClassVar[int]
     HOST_TIME_NS_FIELD_NUMBER: _ClassVar[int]
     POSITION_FIELD_NUMBER: _ClassVar[int]
@@ -72,6 +72,11 @@ class Tick(_message.Message):
     TRIM_FIELD_NUMBER: _ClassVar[int]
     AGE_FIELD_NUMBER: _ClassVar[int]
     OVERTAKEN_FIELD_NUMBER: _ClassVar[int]
+    LEARNING_FIELD_NUMBER: _ClassVar[int]
+    LEARNT_NAMES_FIELD_NUMBER: _ClassVar[int]
+    LEARNT_FIELD_NUMBER: _ClassVar[int]
+    LEARNT_DEVIATION_FIELD_NUMBER: _ClassVar[int]
+    LEARNT_ACTING_FIELD_NUMBER: _ClassVar[int]
     vehicle_time_us: int
     host_time_ns: int
     position: Vector3
@@ -106,7 +111,12 @@ class Tick(_message.Message):
     trim: Vector3
     age: float
     overtaken: int
-    def __init__(self, vehicle_time_us: _Optional[int] = ..., host_time_ns: _Optional[int] = ..., position: _Optional[_Union[Vector3, _Mapping]] = ..., velocity: _Optional[_Union[Vector3, _Mapping]] = ..., quaternion: _Optional[_Union[Quaternion, _Mapping]] = ..., angular_velocity: _Optional[_Union[Vector3, _Mapping]] = ..., specific_force: _Optional[_Union[Vector3, _Mapping]] = ..., position_reference: _Optional[_Union[Vector3, _Mapping]] = ..., velocity_reference: _Optional[_Union[Vector3, _Mapping]] = ..., acceleration_reference: _Optional[_Union[Vector3, _Mapping]] = ..., yaw_reference: _Optional[float] = ..., feedback: _Optional[_Union[Command, _Mapping]] = ..., correction: _Optional[_Union[Vector3, _Mapping]] = ..., correction_raw: _Optional[_Union[Vector3, _Mapping]] = ..., thrust_command: _Optional[float] = ..., body_rate_command: _Optional[_Union[Vector3, _Mapping]] = ..., battery_voltage: _Optional[float] = ..., rotor_speed: _Optional[_Iterable[float]] = ..., model: _Optional[str] = ..., controller: _Optional[str] = ..., flight_mode: _Optional[str] = ..., armed: _Optional[bool] = ..., phase: _Optional[str] = ..., guard: _Optional[str] = ..., interval: _Optional[float] = ..., latency: _Optional[float] = ..., inference: _Optional[float] = ..., setpoint_sent: _Optional[bool] = ..., trajectory: _Optional[str] = ..., shadow: _Optional[str] = ..., shadow_raw: _Optional[_Union[Vector3, _Mapping]] = ..., trim: _Optional[_Union[Vector3, _Mapping]] = ..., age: _Optional[float] = ..., overtaken: _Optional[int] = ...) -> None: ...
+    learning: str
+    learnt_names: str
+    learnt: _containers.RepeatedScalarFieldContainer[float]
+    learnt_deviation: _containers.RepeatedScalarFieldContainer[float]
+    learnt_acting: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, vehicle_time_us: _Optional[int] = ..., host_time_ns: _Optional[int] = ..., position: _Optional[_Union[Vector3, _Mapping]] = ..., velocity: _Optional[_Union[Vector3, _Mapping]] = ..., quaternion: _Optional[_Union[Quaternion, _Mapping]] = ..., angular_velocity: _Optional[_Union[Vector3, _Mapping]] = ..., specific_force: _Optional[_Union[Vector3, _Mapping]] = ..., position_reference: _Optional[_Union[Vector3, _Mapping]] = ..., velocity_reference: _Optional[_Union[Vector3, _Mapping]] = ..., acceleration_reference: _Optional[_Union[Vector3, _Mapping]] = ..., yaw_reference: _Optional[float] = ..., feedback: _Optional[_Union[Command, _Mapping]] = ..., correction: _Optional[_Union[Vector3, _Mapping]] = ..., correction_raw: _Optional[_Union[Vector3, _Mapping]] = ..., thrust_command: _Optional[float] = ..., body_rate_command: _Optional[_Union[Vector3, _Mapping]] = ..., battery_voltage: _Optional[float] = ..., rotor_speed: _Optional[_Iterable[float]] = ..., model: _Optional[str] = ..., controller: _Optional[str] = ..., flight_mode: _Optional[str] = ..., armed: _Optional[bool] = ..., phase: _Optional[str] = ..., guard: _Optional[str] = ..., interval: _Optional[float] = ..., latency: _Optional[float] = ..., inference: _Optional[float] = ..., setpoint_sent: _Optional[bool] = ..., trajectory: _Optional[str] = ..., shadow: _Optional[str] = ..., shadow_raw: _Optional[_Union[Vector3, _Mapping]] = ..., trim: _Optional[_Union[Vector3, _Mapping]] = ..., age: _Optional[float] = ..., overtaken: _Optional[int] = ..., learning: _Optional[str] = ..., learnt_names: _Optional[str] = ..., learnt: _Optional[_Iterable[float]] = ..., learnt_deviation: _Optional[_Iterable[float]] = ..., learnt_acting: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Event(_message.Message):
     __slots__ = ("vehicle_time_us", "host_time_ns", "level", "kind", "text")

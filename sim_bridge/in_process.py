@@ -14,10 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from trueflight.companion.law.adaptation import Told
 from trueflight.companion.law.control import ControlLaw, ControlStep, State
 from trueflight.companion.law.controllers import Preview, make_controller
 from trueflight.companion.law.guard import Guard
-from trueflight.companion.law.inference import check_model
+from trueflight.companion.law.inference import cannot_learn, check_model
+from trueflight.models.contract import CORRECTED_ADAPTIVE
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS
 from trueflight.models.record import FlightRecorder
@@ -47,6 +49,7 @@ class Sample(NamedTuple):
     guard: str
     inference: float
     mission: bool
+    learning: Told | None = None
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
     waiting = math.ceil(plan.settle / period - 1e-9)
     controller.start()
     reported, step = simulator.reported, simulator.step
-    status, inference = "off", 0.0
+    status, inference, learning = "off", 0.0, None
     begin = time.perf_counter()
     for preview in _previews(plan, period):
         reference = preview(0.0)
@@ -104,8 +107,10 @@ def fly(plan: Plan, on_sample: Callable[[Sample], None]) -> Flown:
         control = controller.step(state, preview, period if ticks else 0.0)
         if guard is not None:
             status, inference = guard.status, guard.inference_time
+            learning = guard.learning.told if guard.learning is not None else None
+        mission = ticks >= waiting
         on_sample(
-            Sample(now, position, reference, control, simulator.motors, status, inference, ticks >= waiting)
+            Sample(now, position, reference, control, simulator.motors, status, inference, mission, learning)
         )
         ticks += 1
         rx, ry, rz = reference.position
@@ -156,7 +161,10 @@ def _guard(plan: Plan) -> Guard | None:
     verdict = check_model(plan.model, plan.vehicle)
     if verdict.model is None:
         raise InputError(f"--model: refused: {verdict.reason}")
-    return Guard(verdict.model.watched())
+    learns = plan.controller == CORRECTED_ADAPTIVE
+    if learns and not verdict.model.info.learnables:
+        raise InputError(f"--model: {cannot_learn(verdict.model.info.name)}")
+    return Guard(verdict.model.watched(learns=learns))
 
 
 def _previews(plan: Plan, period: float) -> Iterator[Preview]:
@@ -303,6 +311,11 @@ class _TickWriter:
         tick.guard = sample.guard
         tick.phase = "mission" if sample.mission else "takeoff"
         tick.inference = sample.inference
+        if sample.learning is not None:
+            told = sample.learning
+            tick.learning, tick.learnt_names = told.status, told.names
+            tick.learnt[:], tick.learnt_deviation[:] = told.values, told.deviations
+            tick.learnt_acting[:] = told.acting
         self.messages.append((tick.SerializeToString(), now.time_us, host))
 
 

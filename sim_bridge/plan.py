@@ -9,7 +9,7 @@ from pathlib import Path
 
 from trueflight.companion.law.controllers import TrimLimits
 from trueflight.companion.law.residual import ObserverLimits
-from trueflight.models.contract import CORRECTED, LQR
+from trueflight.models.contract import CORRECTED, LQR, WITH_MODEL
 from trueflight.models.design import Design, load_design
 from trueflight.models.errors import InputError
 from trueflight.models.reference import trajectory, trajectory_from_csv
@@ -54,8 +54,10 @@ class Plan:
     def __post_init__(self) -> None:
         if not self.controller:
             object.__setattr__(self, "controller", LQR if self.model is None else CORRECTED)
-        if (self.model is None) != (self.controller != CORRECTED):
-            raise InputError("--controller corrected needs --model, and no other controller takes one")
+        if (self.model is None) != (self.controller not in WITH_MODEL):
+            raise InputError(
+                "--controller corrected and corrected_adaptive need --model, and no other controller takes one"
+            )
 
     @property
     def steps_per_tick(self) -> int:

@@ -4,6 +4,7 @@
 * `lqr_integral`: the cascade with an integral in the position loop, the paper's third controller.
 * `corrected`: the cascade with the learned correction (22), the inverse of the known actuation, a
   disturbance observer and a slow trim.
+* `corrected_adaptive`: the same, with a model whose numbers are learnt anew in flight.
 * `indi`, `l1_adaptive`, `geometric`, `px4_cascade`: after other papers, to compare with; each in its own module.
 
 The correction has to arrive as an acceleration, so what lies between command and acceleration is undone where
@@ -24,6 +25,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from trueflight.companion.law.actuation import Actuation, LagInverse, RateModel
+from trueflight.companion.law.adaptation import Learning
 from trueflight.companion.law.behaviour import LinearBehaviour
 from trueflight.companion.law.control import (
     ZERO,
@@ -43,7 +45,15 @@ from trueflight.companion.law.outer_loop import AUTHORITY, LONGEST_STEP
 from trueflight.companion.law.px4_cascade import Px4Cascade
 from trueflight.companion.law.residual import DisturbanceObserver, ObserverLimits
 from trueflight.companion.law.steps import Controller, Preview
-from trueflight.models.contract import CORRECTED, GEOMETRIC, INDI, L1_ADAPTIVE, LQR, LQR_INTEGRAL, PX4_CASCADE
+from trueflight.models.contract import (
+    GEOMETRIC,
+    INDI,
+    L1_ADAPTIVE,
+    LQR,
+    LQR_INTEGRAL,
+    PX4_CASCADE,
+    WITH_MODEL,
+)
 from trueflight.models.controllers import check_controller, plug_ins
 from trueflight.models.errors import InputError
 from trueflight.models.trajectory import ReferenceSample
@@ -67,6 +77,11 @@ class Corrector(Protocol):
         ...
 
     @property
+    def learning(self) -> Learning | None:
+        """What the live model learns in this flight; None where it learns nothing."""
+        ...
+
+    @property
     def engaged(self) -> float:
         """Share, 0 to 1, to which models act now."""
         ...
@@ -74,6 +89,11 @@ class Corrector(Protocol):
     @property
     def actuation(self) -> Actuation:
         """What is known of the path from command to motion."""
+        ...
+
+    def learn(self, row: Sequence[float], measured: Vector | None, dt: float, waits: str) -> None:
+        """Let the live model learn, where it does: features of now with the thrust that acts, the error acceleration
+        measured there (None where it cannot be believed), and why nothing may be learnt now, in words."""
         ...
 
     def step(self, rows: Sequence[list[float]], ahead: float, dt: float, height: float) -> Correction:
@@ -105,9 +125,9 @@ def make_controller(
     observer: ObserverLimits | None = None,
 ) -> Controller:
     """The controller of this name; raises `InputError` for an unknown one or one that lacks what it needs."""
-    if name == CORRECTED:
+    if name in WITH_MODEL:
         if corrector is None:
-            raise InputError("controller 'corrected' needs a deployed model")
+            raise InputError(f"controller '{name}' needs a deployed model")
         return Corrected(law, corrector, trim or TrimLimits(), observer or ObserverLimits())
     check_controller(name)
     return _ALONE[name](law) if name in _ALONE else _plugged(name, law)
@@ -272,6 +292,8 @@ class Corrected:
             (state, Attitude(zeta[0], zeta[1], acting)),
         )
         rows = [features(then, yaw, attitude, voltage, corrector.wants_yaw) for then, attitude in moments]
+        if corrector.learning is not None:
+            corrector.learn(rows[3], self._observer.beyond_linear(zeta), dt, self._why_not_learn())
         correction = corrector.step(rows, ahead, dt, state.height)
         (u, v, w), (pushing_x, pushing_y) = self._observer.step(zeta, correction.now, dt)
         trim = (trim[0] + share * u, trim[1] + share * v, trim[2] + share * w)
@@ -295,6 +317,10 @@ class Corrected:
         self._command = command.body_rate
         self._observer.commanded(command.thrust)
         return ControlStep(plain, (x, y, z), correction.raw, command, law.normalised(command.thrust), trim)
+
+    def _why_not_learn(self) -> str:
+        """Why nothing can be learnt from this tick, in words; empty where it can."""
+        return "the trajectory is over" if not self._running else "at the limits" if self._at_limit else ""
 
     def _ahead(self, state: State, acceleration: Vector, h: float) -> State:
         """The state `h` s later at this acceleration (m/s², world), attitude as it is.

@@ -17,6 +17,7 @@ from dataclasses import astuple
 from typing import NamedTuple
 
 from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
+from trueflight.companion.law.adaptation import Learning
 from trueflight.companion.law.outer_loop import mixed
 from trueflight.companion.law.watch import ZERO, GuardLimits, Vector, Watch
 
@@ -136,6 +137,19 @@ class Guard:
             self._live = None
         else:
             self._enter(target)
+
+    @property
+    def learning(self) -> Learning | None:
+        """What the live model learns; None where it learns nothing."""
+        return self._live.learning if self._live is not None else None
+
+    def learn(self, row: Sequence[float], measured: Vector | None, dt: float, waits: str) -> None:
+        """Let the live model learn from what the accelerometer shows at features `row`, where it acts wholly: see
+        `companion.law.adaptation.Learning.step`."""
+        live = self._live
+        if live is not None and live.learning is not None:
+            acts = not live.tripped and self._weights[live] == 1.0
+            live.learn(row, measured, dt, waits or ("" if acts else "the correction does not act"))
 
     @property
     def engaged(self) -> float:

@@ -117,6 +117,19 @@ class DisturbanceObserver:
         self._thrust = self._mass * acting.step(dt)
         return self._acceleration, self._thrust
 
+    def beyond_linear(self, zeta: Vector) -> Vector | None:
+        """Error acceleration (10) now: what is measured beyond the hover linearisation at attitude `zeta` (roll, pitch,
+        yaw in rad) and at the thrust that acts; None where nothing is measured that is wholly believed."""
+        if self._measured.trust != 1.0:
+            return None
+        x, y, z = self._acceleration
+        c, s = math.cos(zeta[2]), math.sin(zeta[2])
+        return (
+            c * x + s * y - GRAVITY * zeta[1],
+            c * y - s * x + GRAVITY * zeta[0],
+            z + GRAVITY - self._thrust / self._mass,
+        )
+
     def commanded(self, thrust: float) -> None:
         """A thrust (N) goes out now."""
         self._acting.commanded(thrust)

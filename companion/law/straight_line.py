@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from struct import Struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -93,6 +93,10 @@ _OPERATORS: dict[str, tuple[int, str]] = {
     "Sin": (1, "sine({0})"),
     "Cos": (1, "cosine({0})"),
     "Identity": (1, "{0}"),
+    "Greater": (2, "{0} > {1}"),
+    "Less": (2, "{0} < {1}"),
+    "And": (2, "{0} and {1}"),
+    "Where": (3, "{1} if {0} else {2}"),
 }
 """What may be written out for columns of single numbers; `Clip`, `Gather`, `Unsqueeze` and `Concat` beside them."""
 
@@ -100,21 +104,22 @@ _OPERATORS: dict[str, tuple[int, str]] = {
 class StraightLine:
     """The graph of one file; call it with rows of features for three accelerations each (m/s², heading frame).
 
-    One thread at a time. Raises `NoStraightLine` where the graph holds what is not written out.
+    A graph of a model that learns takes as many `parameters`, and has a second output, `sensed`. One thread at a time.
+    Raises `NoStraightLine` where the graph holds what is not written out.
     """
 
-    def __init__(self, onnx: bytes, width: int) -> None:
-        graph = _Graph(decoded(onnx).graph, width)
-        self._known = graph.function()
+    def __init__(self, onnx: bytes, width: int, parameters: int = 0) -> None:
+        graph = _Graph(decoded(onnx).graph, width, parameters)
+        self._known, self._slopes = graph.function(), graph.slopes()
         layers, self._fades = graph.layers, graph.fades
         self._network = _Network(layers, width) if layers else None
 
-    def __call__(self, rows: Rows) -> Sequence[Sequence[float]]:
+    def __call__(self, rows: Rows, parameters: Sequence[float] = ()) -> Sequence[Sequence[float]]:
         """Three accelerations for each row."""
         learnt: Sequence[Sequence[float]]
         known, network = self._known, self._network
         if network is None:
-            return [known(row) for row in rows]
+            return [known(row, parameters) for row in rows]
         learnt = network.rows(rows)
         if self._fades:
             learnt = [_faded(*row) for row in learnt]
@@ -122,12 +127,24 @@ class StraightLine:
             return learnt
         both: list[Sequence[float]] = []
         for row, (u, v, w) in zip(rows, learnt, strict=True):
-            x, y, z = known(row)
+            x, y, z = known(row, parameters)
             both.append((x + u, y + v, z + w))
         return both
 
+    def sensed(
+        self, row: Sequence[float], parameters: Sequence[float]
+    ) -> tuple[Sequence[float], Sequence[float]]:
+        """Three accelerations of a row, and their derivatives along each parameter, three by three."""
+        assert self._slopes is not None
+        x, y, z, *slopes = self._slopes(row, parameters)
+        if self._network is not None:
+            (learnt,) = self._network.rows((row,))
+            u, v, w = _faded(*learnt) if self._fades else learnt
+            x, y, z = x + u, y + v, z + w
+        return (x, y, z), slopes
 
-def _nothing(row: Sequence[float]) -> tuple[float, float, float]:
+
+def _nothing(row: Sequence[float], parameters: Sequence[float]) -> Sequence[float]:
     return 0.0, 0.0, 0.0
 
 
@@ -194,13 +211,25 @@ class _Room:
         return self._answer()
 
 
+Columns = Callable[[Sequence[float], Sequence[float]], Sequence[float]]
+"""A function of a row of features and of parameters."""
+
+
+class _Line(NamedTuple):
+    """One line of code: a variable, what it is, and the variables in that."""
+
+    name: str
+    text: str
+    uses: tuple[str, ...]
+
+
 class _Graph:
     """What a graph is made of: columns of single numbers as lines of code, and one chain of layers."""
 
-    def __init__(self, graph: Any, width: int) -> None:
-        self._width = width
+    def __init__(self, graph: Any, width: int, parameters: int = 0) -> None:
+        self._width, self._parameters = width, parameters
         self._constants = {bytes(tensor.name): tensor for tensor in graph.initializer}
-        self._lines: list[str] = []
+        self._lines: list[_Line] = []
         self._columns: dict[bytes, str] = {}
         self._matrices: dict[bytes, list[Layer]] = {contract.INPUT_NAME.encode(): []}
         self._unsqueezed: dict[bytes, str] = {}
@@ -215,14 +244,30 @@ class _Graph:
         self.fades = learnt in self._faded
         self.layers = self._ended(learnt) if learnt else []
 
-    def function(self) -> Callable[[Sequence[float]], tuple[float, float, float]]:
-        """From one row of features to what the columns add to the answer."""
-        if not self._stack:
-            return _nothing
-        text = "\n    ".join(["def known(f):", *self._lines, f"return {', '.join(self._stack)}"])
+    def function(self) -> Columns:
+        """From one row of features, and parameters, to what the columns add to the answer."""
+        return self._written(self._stack) if self._stack else _nothing
+
+    def slopes(self) -> Columns | None:
+        """The same followed by its derivatives; None where the graph has no parameters."""
+        if not self._parameters:
+            return None
+        slopes = self._stacks.get(contract.SENSITIVITY_NAME.encode(), [])
+        if not self._stack or len(slopes) != 3 * self._parameters:
+            raise NoStraightLine("a sensitivity of other than three columns for each parameter")
+        return self._written([*self._stack, *slopes])
+
+    def _written(self, columns: Sequence[str]) -> Columns:
+        """A function of the lines that these columns need."""
+        needed, lines = set(columns), []
+        for line in reversed(self._lines):
+            if line.name in needed:
+                needed.update(line.uses)
+                lines.append(f"{line.name} = {line.text}")
+        text = "\n    ".join(["def known(f, p):", *reversed(lines), f"return {', '.join(columns)}"])
         names: dict[str, Any] = {"__builtins__": {}, **_FUNCTIONS}
         exec(compile(text, "<straight line>", "exec"), names)  # of the operators above alone
-        known: Callable[[Sequence[float]], tuple[float, float, float]] = names["known"]
+        known: Columns = names["known"]
         return known
 
     def _answer(self) -> tuple[list[str], bytes]:
@@ -248,7 +293,7 @@ class _Graph:
     def _take(self, node: Any) -> None:
         kind = bytes(node.op_type).decode("ascii", "replace")
         given = [bytes(name) for name in node.input]
-        if node.domain or len(node.output) != 1 or not given or self._sum is not None:
+        if node.domain or len(node.output) != 1 or not given:
             raise NoStraightLine(f"a node {kind} that is not a plain operator")
         out = bytes(node.output[0])
         taken = (self._columns, self._matrices, self._faded, self._stacks, self._constants)
@@ -267,16 +312,19 @@ class _Graph:
             self._column(kind, out, given, options)
 
     def _gather(self, out: bytes, given: list[bytes], options: dict[bytes, Any]) -> None:
-        """One feature: `features[:, i]`."""
+        """One feature or one parameter: `features[:, i]`."""
         whole = self._whole(given[1]) if len(given) == 2 else None
-        fits = (
-            given[0] == contract.INPUT_NAME.encode() and set(options) == {b"axis"} and options[b"axis"].i == 1
-        )
-        if not fits or whole is None or len(whole) != 1 or not 0 <= whole[0] < self._width:
-            raise NoStraightLine("a Gather of other than one feature")
+        along = set(options) == {b"axis"} and options[b"axis"].i == 1
+        inputs = {
+            contract.INPUT_NAME.encode(): ("f", self._width),
+            contract.PARAMETERS_NAME.encode(): ("p", self._parameters),
+        }
+        letter, width = inputs.get(given[0], ("", 0))
+        if not along or whole is None or len(whole) != 1 or not 0 <= whole[0] < width:
+            raise NoStraightLine("a Gather of other than one feature or parameter")
         if self._constants[given[1]].dims:
             raise NoStraightLine("a Gather that keeps the axis")
-        self._define(out, f"f[{whole[0]}]")
+        self._define(out, f"{letter}[{whole[0]}]")
 
     def _unsqueeze(self, out: bytes, given: list[bytes]) -> None:
         if len(given) != 2 or given[0] not in self._columns or self._whole(given[1]) not in ([-1], [1]):
@@ -285,8 +333,9 @@ class _Graph:
 
     def _concat(self, out: bytes, given: list[bytes], options: dict[bytes, Any]) -> None:
         axis = set(options) == {b"axis"} and options[b"axis"].i in (-1, 1)
-        if not axis or len(given) != 3 or not all(name in self._unsqueezed for name in given):
-            raise NoStraightLine("a Concat of other than three columns")
+        width = 3 * self._parameters if out == contract.SENSITIVITY_NAME.encode() else 3
+        if not axis or len(given) != width or not all(name in self._unsqueezed for name in given):
+            raise NoStraightLine(f"a Concat of other than {width} columns")
         self._stacks[out] = [self._unsqueezed[name] for name in given]
 
     def _matrix(self, kind: str, out: bytes, given: list[bytes], options: dict[bytes, Any]) -> None:
@@ -355,7 +404,8 @@ class _Graph:
             return
         if kind not in _OPERATORS or _OPERATORS[kind][0] != len(given):
             raise NoStraightLine(f"the operator {kind}")
-        self._define(out, _OPERATORS[kind][1].format(*(self._operand(name) for name in given)))
+        operands = [self._operand(name) for name in given]
+        self._define(out, _OPERATORS[kind][1].format(*operands), operands)
 
     def _clip(self, out: bytes, given: list[bytes]) -> None:
         if not 1 <= len(given) <= 3:
@@ -367,11 +417,11 @@ class _Graph:
             text = f"{bounds[1]} if {value} > {bounds[1]} else {text}"
         if bounds[0]:  # what is not a number stays it
             text = f"{bounds[0]} if {value} < {bounds[0]} else {text}"
-        self._define(out, text)
+        self._define(out, text, [value, *bounds])
 
-    def _define(self, out: bytes, text: str) -> None:
+    def _define(self, out: bytes, text: str, uses: Sequence[str] = ()) -> None:
         name = f"v{len(self._columns)}"
-        self._lines.append(f"{name} = {text}")
+        self._lines.append(_Line(name, text, tuple(uses)))
         self._columns[out] = name
 
     def _operand(self, name: bytes) -> str:

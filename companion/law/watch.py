@@ -15,6 +15,7 @@ from functools import partial
 from typing import NamedTuple
 
 from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
+from trueflight.companion.law.adaptation import Learning
 
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
@@ -87,7 +88,10 @@ class Watch:
         name: str = "",
         clock: Callable[[], float] = time.thread_time,
         actuation: Actuation = ACTS_AT_ONCE,
+        learning: Learning | None = None,
     ) -> None:
+        self.learning = learning
+        """What learns while it flies, where the model does; then it is the model."""
         self.name, self.wants_yaw, self.actuation = name, wants_yaw, actuation
         self.limits = limits if limits is not None else GuardLimits()
         self.reason = ""
@@ -107,6 +111,12 @@ class Watch:
     def tripped(self) -> bool:
         """Whether it gave up on this model for the rest of the flight."""
         return self.reason != ""
+
+    def learn(self, row: Sequence[float], measured: Vector | None, dt: float, waits: str) -> None:
+        """Let the model learn, if it does: `companion.law.adaptation.Learning.step`; `row` may be longer than the
+        model's."""
+        if self.learning is not None:
+            self.learning.step(row[: len(self._ranges)], measured, dt, waits)
 
     def evaluate(self, features: Sequence[float], dt: float) -> tuple[Vector, Vector]:
         """The model's raw answer, and what of it may act: finite and within the authority; m/s², heading frame.

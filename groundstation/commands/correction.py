@@ -28,6 +28,7 @@ def export_correction(
     mapping: list[str] | None,
     store: Path,
     as_json: bool,
+    adaptive: bool = False,
 ) -> None:
     """Write a version as an ONNX file or as a C header, and tell what it holds. Raises `InputError` without a flight,
     for an unknown version, and where the file cannot be written."""
@@ -36,11 +37,14 @@ def export_correction(
     from trueflight.groundstation.reading import read_flight
     from trueflight.groundstation.versions.choice import check_vehicle
     from trueflight.groundstation.versions.store import find
+    from trueflight.models.adaptive import adaptive as learnables
     from trueflight.models.contract import model_hash
     from trueflight.models.export import export_onnx, not_exported
 
     if not flight:
         raise InputError(f"{to}: pass --flight, which gives training range and golden vectors")
+    if to == C and adaptive:
+        raise InputError("c: a header learns nothing in flight; leave out --adaptive, or export to onnx")
     if to == C and output.suffix != ENDING:
         raise InputError(f"{output}: a C header ends with {ENDING}; choose another name")
     flights = [read_flight(path, vehicle, mapping) for path in flight]
@@ -48,12 +52,13 @@ def export_correction(
     for one in flights:
         check_vehicle(model, one)
     actuation = actuation_of(model, flights)
-    data = onnx = export_onnx(model, *flights, actuation=actuation)
+    data = onnx = export_onnx(model, *flights, actuation=actuation, adaptive=adaptive)
     written = write(model, deployed(onnx)) if to == C else None
     if written is not None:
         data = written.text.encode()
     write_whole(output, data, "the model", "choose another -o")
     left = not_exported(model)
+    learnt = learnables(model)[1] if adaptive else ()
     if as_json:
         print_json(
             {
@@ -62,6 +67,7 @@ def export_correction(
                 "hash": model_hash(onnx),
                 "bytes": len(data),
                 "not_exported": list(left),
+                "learnt_in_flight": [one.table() for one in learnt],
                 "actuation": actuation,
                 "effects": [row_of(line) for line in written.lines] if written else [],
                 "notes": list(written.notes) if written else [],
@@ -72,6 +78,13 @@ def export_correction(
     if written is not None:
         print_lines(console, written)
     _print_exported(console, actuation, () if written is not None else left)
+    for number in learnt:
+        unit = "" if number.unit == "1" else f" {number.unit}"
+        console.print(
+            f"learnt in flight: {number.effect} {number.parameter} = {number.value:.4g}{unit}, within "
+            f"{number.low:.4g} to {number.high:.4g}",
+            highlight=False,
+        )
 
 
 def _print_exported(console: Console, actuation: Mapping[str, float], left: Sequence[str]) -> None:

@@ -258,6 +258,9 @@ def model_export(
             "--flight", help="For onnx and c: gives training range, golden vectors and actuation. Repeatable."
         ),
     ] = None,
+    adaptive: Annotated[
+        bool, typer.Option("--adaptive", help="For onnx: numbers of it can be learnt anew in flight.")
+    ] = False,
     vehicle: VehicleOption = None,
     mapping: MappingOption = None,
     store: StoreOption = DEFAULT_STORE,
@@ -282,7 +285,11 @@ def model_export(
     mujoco -o vehicle.xml
     """
     if to in CORRECTIONS:
-        export_correction(console, which, to, flight or [], output, vehicle, mapping, store, as_json)
+        export_correction(
+            console, which, to, flight or [], output, vehicle, mapping, store, as_json, adaptive
+        )
         return
+    if adaptive:
+        raise InputError(f"{to}: it learns nothing in flight; leave out --adaptive, or export to onnx")
     model = chosen(to, which, vehicle, name, store)
     export_elsewhere(console, model, to, output, hover_speed, torque_length, as_json)

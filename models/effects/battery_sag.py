@@ -18,7 +18,17 @@ EFFECT = Effect(
     stage=Stage.THRUST,
     formula=formula,
     parameters=(
-        Parameter("exponent", "1", "of voltage over nominal voltage", 0.0, 1.0, 0.0, 3.5, truth="exponent"),
+        Parameter(
+            "exponent",
+            "1",
+            "of voltage over nominal voltage",
+            0.0,
+            1.0,
+            0.0,
+            3.5,
+            truth="exponent",
+            drifts=0.1,
+        ),
     ),
     needs=("thrust_command", "battery_voltage"),
     manoeuvre="one flight from a full to a nearly empty battery, or flights on both",

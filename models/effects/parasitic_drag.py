@@ -21,10 +21,26 @@ EFFECT = Effect(
     formula=formula,
     parameters=(
         Parameter(
-            "x", "1/m", "drag over mass and squared speed along body x", 0.0, 0.05, 0.0, 1.0, truth="x"
+            "x",
+            "1/m",
+            "drag over mass and squared speed along body x",
+            0.0,
+            0.05,
+            0.0,
+            1.0,
+            truth="x",
+            drifts=0.1,
         ),
         Parameter(
-            "y", "1/m", "drag over mass and squared speed along body y", 0.0, 0.05, 0.0, 1.0, truth="y"
+            "y",
+            "1/m",
+            "drag over mass and squared speed along body y",
+            0.0,
+            0.05,
+            0.0,
+            1.0,
+            truth="y",
+            drifts=0.1,
         ),
         Parameter(
             "z", "1/m", "drag over mass and squared speed along body z", 0.0, 0.05, 0.0, 1.0, truth="z"

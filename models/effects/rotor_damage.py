@@ -56,6 +56,7 @@ EFFECT = Effect(
             grows=f"rotor {i} has lost {{:.0%}} of its thrust",
             shrinks=f"rotor {i} has regained {{:.0%}} of its thrust",
             rotor=i,
+            drifts=1.0,
         )
         for i in range(1, MOST_ROTORS + 1)
     ),

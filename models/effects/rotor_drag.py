@@ -33,6 +33,7 @@ EFFECT = Effect(
             0.0,
             2.0,
             truth="x",
+            drifts=0.1,
         ),
         Parameter(
             "y",
@@ -43,6 +44,7 @@ EFFECT = Effect(
             0.0,
             2.0,
             truth="y",
+            drifts=0.1,
         ),
     ),
     needs=("quaternion", "velocity", "thrust_command"),

@@ -25,6 +25,7 @@ EFFECT = Effect(
             truth="gain",
             grows="thrust over mass has risen by {:.1%} of what is believed",
             shrinks="thrust over mass has fallen by {:.1%} of what is believed",
+            drifts=1.0,
         ),
     ),
     needs=("thrust_command",),
@@ -32,6 +33,7 @@ EFFECT = Effect(
     citation="F = m a: specific thrust is c u / m, so a payload, the mass and the thrust constant are one number",
     confounded_with=("thrust_curve", "battery_sag", "accelerometer_bias", "rotor_damage"),
     scales_rotors=True,
+    learnt_unasked=True,
     aliases=("mass", "payload", "thrust constant"),
     on_airframe=lambda airframe, values: airframe.scaled(values["gain"]),
 )

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trueflight.companion.law.control import ControlLaw
-from trueflight.models.contract import CORRECTED, LQR, LQR_INTEGRAL
+from trueflight.models.contract import CORRECTED, CORRECTED_ADAPTIVE, LQR, LQR_INTEGRAL
 from trueflight.models.errors import InputError
 from trueflight.sim_bridge.in_process import FALLEN, LOST, Flown
 from trueflight.sim_bridge.many.cascade import States, Steps
@@ -191,6 +191,8 @@ def _crew(name: str, plans: Sequence[Plan], laws: Sequence[ControlLaw], period: 
         return ManyLqr(laws)
     if name == LQR_INTEGRAL:
         return ManyLqrIntegral(laws)
+    if name == CORRECTED_ADAPTIVE:
+        raise InputError(f"many flights at once do not learn: fly {name} with `sim-bridge fly`, one by one")
     if name != CORRECTED:
         return OneByOne(laws, plans, period)
     from trueflight.sim_bridge.many.corrected import ManyCorrected

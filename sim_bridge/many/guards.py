@@ -168,7 +168,10 @@ class _Group:
             found = [self._model.rows(lists[i : i + moments]) for i in range(0, len(lists), moments)]
             answers = np.array(found, dtype=float)
         else:
-            (out,) = self._session.run([contract.OUTPUT_NAME], {contract.INPUT_NAME: flat.astype(np.float32)})
+            given = {contract.INPUT_NAME: flat.astype(np.float32)}
+            if deployed := self._model.info.deployed:
+                given[contract.PARAMETERS_NAME] = np.tile(np.array(deployed, np.float32), (len(flat), 1))
+            (out,) = self._session.run([contract.OUTPUT_NAME], given)
             answers = np.asarray(out, dtype=float).reshape(count, moments, 3)
         return answers.transpose(1, 2, 0)
 

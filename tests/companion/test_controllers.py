@@ -44,6 +44,10 @@ class Oracle:
     """A corrector that returns what it is told: `delta` of features, wholly engaged."""
 
     wants_yaw = False
+    learning = None
+
+    def learn(self, *told: object) -> None:
+        """It learns nothing."""
 
     def __init__(self, delta=lambda features: ZERO, actuation: Actuation = ACTS_AT_ONCE, engaged=1.0) -> None:
         self.delta, self.actuation, self.engaged = delta, actuation, engaged

@@ -277,7 +277,9 @@ def test_the_corrected_cascade_with_its_guard(vehicle: Vehicle, design: Design) 
 
 
 def test_controllers_without_a_form_for_arrays(vehicle: Vehicle, design: Design) -> None:
-    others = [name for name in contract.CONTROLLERS if name not in ("lqr", "lqr_integral", "corrected")]
+    others = [
+        name for name in contract.CONTROLLERS if name not in ("lqr", "lqr_integral", *contract.WITH_MODEL)
+    ]
     plans = [
         Plan(
             vehicle,
