@@ -29,7 +29,7 @@ from trueflight.groundstation.study.reproduce import (
     prepare,
     through_companion,
 )
-from trueflight.models.contract import CORRECTED, INDI, LQR
+from trueflight.models.contract import CORRECTED, CORRECTED_ADAPTIVE, INDI, LQR
 from trueflight.models.controllers import check_controller, controllers
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -67,9 +67,13 @@ class Cell:
 
 
 def chosen_controllers(names: Sequence[str] | None) -> list[str]:
-    """Controllers of these names, all that are installed where none is named; raises `InputError`."""
-    every = [name for own in controllers() for name in ((EFFECTS_ALONE, own) if own == CORRECTED else (own,))]
+    """Controllers of these names, all that are installed where none is named, but the one that learns in flight: many
+    flights at once do not learn. Raises `InputError`."""
+    installed = [name for name in controllers() if name != CORRECTED_ADAPTIVE]
+    every = [name for own in installed for name in ((EFFECTS_ALONE, own) if own == CORRECTED else (own,))]
     for name in names or ():
+        if name == CORRECTED_ADAPTIVE:
+            raise InputError(f"--controller {name}: it flies one by one; use `sim-bridge fly`")
         if name != EFFECTS_ALONE:
             check_controller(name, "--controller")
     return list(dict.fromkeys(names or every))
