@@ -1,8 +1,8 @@
 """PX4's own multicopter position and attitude control, with its default gains.
 
 Position P, velocity PID with feed-forward, acceleration turned into thrust by exact rotation, attitude P on the
-quaternion with tilt before yaw. Its hover thrust estimator, which learns the thrust gain over tens of seconds, is not
-here, and the limits are those of this project's cascade, so that no controller has more room than another.
+quaternion with tilt before yaw, and the estimator of the thrust that hovers, where there is an accelerometer. The
+limits are those of this project's cascade, so that no controller has more room than another.
 
 Source: PX4 1.17, `PositionControl.cpp`, `AttitudeControl.cpp` and their parameters' defaults; Brescianini, Hehn,
 D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich 2013.
@@ -12,7 +12,18 @@ from __future__ import annotations
 
 import math
 
-from trueflight.companion.law.control import ZERO, Command, ControlLaw, ControlStep, State, Vector, euler
+from trueflight.companion.law.control import (
+    ZERO,
+    Attitude,
+    Command,
+    ControlLaw,
+    ControlStep,
+    State,
+    Vector,
+    euler,
+    world_from_body,
+)
+from trueflight.companion.law.hover_thrust import HoverThrust
 from trueflight.companion.law.outer_loop import LONGEST_STEP, LowPass, OuterLoop, errors
 from trueflight.companion.law.steps import Preview
 from trueflight.models.trajectory import ReferenceSample
@@ -25,6 +36,7 @@ DERIVATIVE = (0.2, 0.2, 0.0)  # MPC_XY_VEL_D_ACC, MPC_Z_VEL_D_ACC
 SLOPE_FREQUENCY = 5.0  # MPC_VELD_LP, Hz
 TURNING = (6.5, 6.5, 2.8)  # MC_ROLL_P, MC_PITCH_P, MC_YAW_P, 1/s
 YAW_WEIGHT = 0.4  # MC_YAW_WEIGHT
+IN_THE_AIR = 1.0  # m above the ground, from which on the thrust that hovers is estimated
 
 Quaternion = tuple[float, float, float, float]
 
@@ -37,6 +49,11 @@ class Px4Cascade:
         self._integral = ZERO
         self._slope = LowPass(SLOPE_FREQUENCY)
         self._velocity: Vector | None = None
+        self._hover = HoverThrust(law.vehicle.hover_thrust)
+        self._asked_up = self._lift = (
+            0.0  # of the last tick: acceleration up (m/s²), vertical command (normalised)
+        )
+        self._flew = False
 
     def start(self) -> None:
         """Nothing: the integral has learned in the climb."""
@@ -48,8 +65,10 @@ class Px4Cascade:
         """One tick."""
         law, reference, zeta = self._law, preview(0.0), euler(state.quaternion)
         dt = min(LONGEST_STEP, max(0.0, dt))
+        self._hovers(state, dt)
         asked, error = self._asked(state, reference, dt)
-        attitude = self._loop.attitude(asked, zeta[2])
+        attitude = self._lifted(self._loop.attitude(asked, zeta[2]))
+        self._asked_up = asked[2]
         if not law.at_limit(attitude):
             x, y, z = (i + dt * k * e for i, k, e in zip(self._integral, INTEGRAL, error, strict=True))
             self._integral = (x, y, min(GRAVITY, max(-GRAVITY, z)))
@@ -65,6 +84,27 @@ class Px4Cascade:
             ),
         )
         return ControlStep(command, ZERO, ZERO, command, law.normalised(command.thrust))
+
+    def _hovers(self, state: State, dt: float) -> None:
+        """Learn what hovers, and keep the thrust as it is: what the new value changes goes into the integral."""
+        self._flew = self._flew or state.height > IN_THE_AIR
+        if not self._flew or state.specific_force is None or dt <= 0.0:
+            return
+        before = self._hover.value
+        up = world_from_body(state.quaternion, state.specific_force)[2] - GRAVITY
+        self._hover.step(up, self._lift, state.velocity, dt)
+        x, y, z = self._integral
+        z += (self._asked_up + GRAVITY) * (before / self._hover.value - 1.0)
+        self._integral = (x, y, min(GRAVITY, max(-GRAVITY, z)))
+
+    def _lifted(self, attitude: Attitude) -> Attitude:
+        """An attitude with the thrust by which the vehicle gives what was asked for, as far as is known."""
+        vehicle = self._law.vehicle
+        thrust = attitude.thrust * self._hover.value / vehicle.hover_thrust
+        limited = self._law.limited(attitude.roll, attitude.pitch, thrust)
+        upright = math.cos(limited.roll) * math.cos(limited.pitch)
+        self._lift = vehicle.hover_thrust * limited.thrust * upright / vehicle.weight
+        return limited
 
     def _asked(self, state: State, reference: ReferenceSample, dt: float) -> tuple[Vector, Vector]:
         """Acceleration asked for (m/s², world), and the error of the velocity (m/s)."""

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from trueflight.companion.law import px4_cascade
 from trueflight.companion.law.control import ZERO, ControlLaw, ControlStep, State
 from trueflight.companion.law.controllers import make_controller
+from trueflight.companion.law.hover_thrust import HoverThrust
 from trueflight.companion.law.outer_loop import ActingThrust, LowPass, OuterLoop
 from trueflight.companion.law.steps import Preview
 from trueflight.models import controllers as known
@@ -119,6 +120,41 @@ def test_px4_attitude_control_turns_towards_the_attitude_asked_for(
     turned = px4_cascade._product(now, tuple(half / np.linalg.norm(half)))
     after = np.array(px4_cascade._product(px4_cascade._conjugate(turned), wanted))
     assert 2.0 * math.acos(min(1.0, abs(float(after[0])))) <= angle + 1e-9
+
+
+@pytest.mark.parametrize("hovers", [0.30, 0.38, 0.46])
+def test_px4_s_estimator_finds_the_thrust_that_hovers_and_finds_it_again_with_a_payload(
+    hovers: float,
+) -> None:
+    estimator, noise = HoverThrust(0.38), np.random.default_rng(1)
+    for true in (hovers, 1.12 * hovers):
+        for tick in range(6000):
+            thrust = true * (1.0 + 0.1 * math.sin(0.05 * tick))
+            acceleration = GRAVITY * (thrust / true - 1.0) + 0.3 * noise.standard_normal()
+            estimator.step(acceleration, thrust, ZERO, DT)
+        assert estimator.value == pytest.approx(true, rel=0.01)
+
+
+def test_px4_s_estimator_says_nothing_before_it_is_sure_and_keeps_to_its_range() -> None:
+    estimator = HoverThrust(0.38)
+    for _ in range(100):  # less than it waits
+        estimator.step(-0.3 * GRAVITY, 0.38, ZERO, DT)
+    assert estimator.value == 0.38
+    for _ in range(20000):
+        estimator.step(-0.9 * GRAVITY, 0.38, ZERO, DT)
+    assert estimator.value == pytest.approx(0.58)
+
+
+def test_px4_s_thrust_does_not_jump_when_it_learns_what_hovers() -> None:
+    controller = make_controller(PX4_CASCADE, LAW)
+    commands = []
+    for _ in range(800):
+        sinks = at_rest((0.0, 0.0, 2.0))._replace(specific_force=(0.0, 0.0, 0.9 * GRAVITY))
+        commands.append(
+            controller.step(sinks, lambda ahead: reference_at((0.0, 0.0, 2.0)), DT).thrust_command
+        )
+    assert controller._hover.value > 1.05 * VEHICLE.hover_thrust  # type: ignore[attr-defined]
+    assert np.abs(np.diff(commands)).max() < 1e-9
 
 
 def test_px4_attitude_control_has_its_gains_for_small_errors() -> None:
