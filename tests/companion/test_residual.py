@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from tests.companion.test_controllers import (
+from test_controllers import (
     DT,
     LAW,
     LIVELY,
@@ -21,6 +20,7 @@ from tests.companion.test_controllers import (
     drag_and_weak_thrust,
     flown,
 )
+
 from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
 from trueflight.companion.law.control import ZERO, State, euler
 from trueflight.companion.law.controllers import Corrected, TrimLimits
