@@ -8,9 +8,12 @@ missing: ENU and FLU (REP 103), unless their frame is named NED.
 
 from __future__ import annotations
 
+import io
 import re
 import sqlite3
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,6 +40,7 @@ ADVICE_DB3 = "bags from before Iron hold none: `ros2 bag convert` to MCAP, with 
 OTHER_CLOCK = 0.5
 """s; stamps further apart from the times of receipt than others count another clock: since boot, not since 1970, or
 that of a computer that was not synchronised."""
+_ONE_AT_A_TIME = threading.Lock()
 VELOCITY = ("twist.twist.linear.x", "twist.twist.linear.y", "twist.twist.linear.z")
 
 
@@ -215,7 +219,9 @@ def _px4_name(topic: str) -> str:
 
 def _decoder(factory: Any, encoding: str, schema: Schema | None) -> Callable[[bytes], Any] | None:
     try:
-        decode: Callable[[bytes], Any] | None = factory.decoder_for(encoding, schema)
+        # the parser of definitions prints a line of its own before it raises; stderr is the process's: one at a time
+        with _ONE_AT_A_TIME, redirect_stderr(io.StringIO()):
+            decode: Callable[[bytes], Any] | None = factory.decoder_for(encoding, schema)
     except Exception:  # noqa: BLE001 - a definition that does not parse raises whatever its parser meets
         return None
     return decode

@@ -1,8 +1,10 @@
 """Recordings of ROS 2: PX4's messages make the same flight as its ULog; ROS' own stand in where they are missing."""
 
 import json
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,6 +87,19 @@ def test_a_bag_that_is_damaged_is_read_as_far_as_it_goes_or_told(tmp_path):
             read_flight(cut, VEHICLE)
         except InputError as error:
             assert str(cut) in str(error) and "\n" not in str(error)
+
+
+def test_a_definition_that_does_not_parse_is_told_in_a_note_and_nowhere_else(tmp_path, capfd):
+    path = as_db3(ros_messages(Bag(tmp_path / "bag.mcap")), tmp_path / "bag_0.db3")
+    with closing(sqlite3.connect(path)) as bag, bag:
+        bag.execute(
+            "UPDATE message_definitions SET encoded_message_definition = 'float64 x' || char(10) || 'int32[ n' "
+            "WHERE topic_type = 'sensor_msgs/msg/Imu'"
+        )
+    log = load_ros_bag(path)
+    assert "vehicle_local_position" in log.topics
+    assert any("no readable definition" in note for note in log.notes)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_pose_alone_gives_a_flight_whose_velocity_is_differentiated(tmp_path):
