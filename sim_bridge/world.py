@@ -115,7 +115,7 @@ class World:
         # A free joint's generalised force is the force in the world and the torque in the body.
         self.wrench = _floats(self.data.qfrc_applied)
         self._mass, self._inertia = float(self.model.body_mass[1]), self.model.body_inertia[1].copy()
-        self._loaded: tuple[float, np.ndarray] = (0.0, np.zeros(3))
+        self._load, self._wrong = (0.0, 0.0), np.zeros(3)
         mujoco.mj_forward(self.model, self.data)
 
     def step(self) -> None:
@@ -138,21 +138,25 @@ class World:
         """Whether any part of the vehicle touches the ground."""
         return bool(self.data.ncon)
 
-    def load(self, mass: float, inertia: float | tuple[float, float, float]) -> None:
-        """Fix a further payload (kg, kg m² about every axis, or about each) to the vehicle, with its centre in the
-        centre of mass."""
-        before, moments = self._loaded
-        self._loaded = before + mass, moments + inertia
-        self._weigh(self._mass + self._loaded[0], self._inertia + self._loaded[1])
+    def load(self, mass: float, inertia: float) -> None:
+        """The payload (kg, kg m² about every axis) is this one now, with its centre in the centre of mass; none: 0."""
+        self._load = mass, inertia
+        self._weigh()
+
+    def spread(self, inertia: tuple[float, float, float]) -> None:
+        """The vehicle's own moments (kg m²) are so much greater than its file says."""
+        self._wrong = np.array(inertia)
+        self._weigh()
 
     def unload(self) -> None:
         """The vehicle's own mass and inertia again."""
-        self._loaded = 0.0, np.zeros(3)
-        self._weigh(self._mass, self._inertia)
+        self._load, self._wrong = (0.0, 0.0), np.zeros(3)
+        self._weigh()
 
-    def _weigh(self, mass: float, inertia: np.ndarray) -> None:
-        self.model.body_mass[1] = mass
-        self.model.body_inertia[1] = inertia
+    def _weigh(self) -> None:
+        mass, inertia = self._load
+        self.model.body_mass[1] = self._mass + mass
+        self.model.body_inertia[1] = self._inertia + inertia + self._wrong
         # What contacts derive from masses follows; the scratch data keeps the present state out of it.
         mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
 

@@ -19,9 +19,13 @@ class Load:
     def __init__(self, bodies: Bodies, index: int) -> None:
         self._bodies, self._index = bodies, index
 
-    def load(self, mass: float, inertia: float | tuple[float, float, float]) -> None:
-        """Fix a further payload (kg, kg m² about every axis, or about each) to this body."""
+    def load(self, mass: float, inertia: float) -> None:
+        """The payload (kg, kg m² about every axis) of this body is this one now."""
         self._bodies.load(self._index, mass, inertia)
+
+    def spread(self, inertia: tuple[float, float, float]) -> None:
+        """This body's own moments (kg m²) are so much greater than believed."""
+        self._bodies.spread(self._index, inertia)
 
 
 class Bodies:
@@ -48,7 +52,8 @@ class Bodies:
         self._inertia = np.array([model.body_inertia[1] for model in models]).T.copy()
         self._near = np.array([reach(vehicle) for vehicle in vehicles]) + _MARGIN
         self._worlds: dict[int, World] = {}
-        self._payloads: dict[int, list[tuple[float, float | tuple[float, float, float]]]] = {}
+        self._payloads: dict[int, tuple[float, float]] = {}
+        self._wrong: dict[int, tuple[float, float, float]] = {}
         self._work3, self._turned, self._square = (
             np.empty((3, count)),
             np.empty((4, count)),
@@ -63,14 +68,23 @@ class Bodies:
         self.velocity[:, index] = 0.0
         self.touching[index] = False
 
-    def load(self, index: int, mass: float, inertia: float | tuple[float, float, float]) -> None:
-        """Fix a further payload (kg, kg m² about every axis, or about each) to one vehicle."""
-        self._payloads.setdefault(index, []).append((mass, inertia))
-        self._mass[index] += mass
-        self._inertia[:, index] += inertia
+    def load(self, index: int, mass: float, inertia: float) -> None:
+        """The payload (kg, kg m² about every axis) of one vehicle is this one now."""
+        before, moments = self._payloads.get(index, (0.0, 0.0))
+        self._payloads[index] = mass, inertia
+        self._mass[index] += mass - before
+        self._inertia[:, index] += inertia - moments
         self._weigh()
         if index in self._worlds:
             self._worlds[index].load(mass, inertia)
+
+    def spread(self, index: int, inertia: tuple[float, float, float]) -> None:
+        """One vehicle's own moments (kg m²) are so much greater than believed."""
+        self._inertia[:, index] += np.subtract(inertia, self._wrong.get(index, (0.0, 0.0, 0.0)))
+        self._wrong[index] = inertia
+        self._weigh()
+        if index in self._worlds:
+            self._worlds[index].spread(inertia)
 
     def step(self, wrench: np.ndarray) -> None:
         """Advance by `PHYSICS_STEP` under `wrench` (6, N): force (N, world) and torque (N m, body)."""
@@ -141,8 +155,10 @@ class Bodies:
         world = self._worlds.get(index)
         if world is None:
             world = self._worlds[index] = World(self._vehicles[index])
-            for payload in self._payloads.get(index, ()):
-                world.load(*payload)
+            if index in self._payloads:
+                world.load(*self._payloads[index])
+            if index in self._wrong:
+                world.spread(self._wrong[index])
         data = world.data
         data.qpos[:] = position
         data.qvel[:] = velocity

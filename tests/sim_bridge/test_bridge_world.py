@@ -9,6 +9,7 @@ import pytest
 
 from trueflight.models.errors import InputError
 from trueflight.models.vehicle import GRAVITY, Vehicle
+from trueflight.sim_bridge.many.bodies import Bodies, Load
 from trueflight.sim_bridge.rates import IDLE_SHARE, Mixer
 from trueflight.sim_bridge.simulator import Simulator
 from trueflight.sim_bridge.truth.airframe import believed_powertrain
@@ -162,3 +163,22 @@ def test_a_saturated_mixer_stays_in_range_and_gives_up_yaw_first(vehicle: Vehicl
     mixer.mix(collective, roll, pitch, 0.0)
     if not mixer.saturated:
         assert made[:2] == pytest.approx(wanted)
+
+
+def test_a_payload_takes_the_place_of_the_one_before_and_wrong_moments_stay(vehicle: Vehicle) -> None:
+    world, many = World(vehicle), Bodies([vehicle] * 2)
+    own = float(world.model.body_mass[1]), world.model.body_inertia[1].copy()
+    one = Load(many, 1)
+    for body in (world, one):
+        body.spread((1e-3, 2e-3, 3e-3))
+        body.load(0.3, 1e-4)
+        body.load(0.1, 2e-4)
+    assert world.model.body_mass[1] == pytest.approx(own[0] + 0.1)
+    assert world.model.body_inertia[1] == pytest.approx(own[1] + (1.2e-3, 2.2e-3, 3.2e-3))
+    assert many._mass == pytest.approx([own[0], own[0] + 0.1])
+    assert many._inertia[:, 1] == pytest.approx(world.model.body_inertia[1])
+    for body in (world, one):
+        body.load(0.0, 0.0)  # dropped
+    assert (world.model.body_mass[1], many._mass[1]) == pytest.approx((own[0], own[0]))
+    world.unload()
+    assert world.model.body_inertia[1] == pytest.approx(own[1])

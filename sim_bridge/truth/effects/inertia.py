@@ -25,8 +25,8 @@ class Inertia(TruthEffect):
 
     def event(self, vehicle: Vehicle, numbers: dict[str, float]) -> Event:
         """The rigid body's own, from the moment it is in the air."""
-        more = tuple((numbers["factor"] - 1.0) * moment for moment in vehicle.inertia)
-        return 0.0, lambda world: world.load(0.0, more)
+        x, y, z = ((numbers["factor"] - 1.0) * moment for moment in vehicle.inertia)
+        return 0.0, lambda world: world.spread((x, y, z))
 
 
 EFFECT = Inertia()
