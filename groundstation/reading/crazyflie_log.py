@@ -144,7 +144,8 @@ def _joined(raw: np.ndarray, events: list[Event], head: int, unit: float) -> dic
             continue
         rows = raw[places[:, None] + head + np.arange(event.row.itemsize)].copy().view(event.row)[:, 0]
         for i, name in enumerate(event.variables):
-            column = rows[str(i)].astype(float)
+            with np.errstate(invalid="ignore"):  # a damaged file holds what is no number
+                column = rows[str(i)].astype(float)
             if name == "stateEstimateZ.quat":
                 for letter, part in zip("xyzw", _unpacked(rows[str(i)].astype(np.uint64)).T, strict=True):
                     columns.setdefault(f"{name}.{letter}", part if t is clock else np.interp(clock, t, part))

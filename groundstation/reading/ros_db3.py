@@ -28,7 +28,10 @@ class BagTopic:
 @contextmanager
 def opened(path: Path) -> Iterator[sqlite3.Connection]:
     """A bag opened to be read, whoever else has it open. Raises `sqlite3.Error` for what is none."""
-    connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+    changes = path.with_name(f"{path.name}-wal")
+    # where nobody has a log of changes open, SQLite would leave an empty one beside the bag
+    alone = "" if changes.exists() else "&immutable=1"
+    connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{alone}", uri=True)
     try:
         try:
             connection.execute("SELECT count(*) FROM topics")

@@ -160,3 +160,13 @@ def test_a_blackbox_that_was_not_converted_is_told_how(tmp_path):
     with pytest.raises(InputError, match="blackbox_decode") as error:
         read_flight(path, QUAD5)
     assert "\n" not in str(error.value)
+
+
+def test_a_number_of_a_damaged_card_that_is_none_is_no_warning(tmp_path, recwarn):
+    """A signalling NaN, which numpy warns of where it widens it."""
+    t = 0.01 * np.arange(50)
+    data = usd({"fixedFrequency": (t, {"acc.z": ("f", np.where(t == t[7], 3.0, 1.0))})})
+    path = tmp_path / "log00"
+    path.write_bytes(data.replace(struct.pack("<f", 3.0), struct.pack("<I", 0x7FA00000)))
+    assert np.isnan(read_usd_log(path).columns["acc.z"][7])
+    assert not recwarn.list

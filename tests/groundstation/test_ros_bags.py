@@ -70,6 +70,21 @@ def test_a_bag_in_sqlite_is_the_same_flight(definitions, tmp_path):
     np.testing.assert_array_equal(flight.specific_force, same.specific_force)
 
 
+def test_nothing_is_left_beside_a_bag_and_one_that_is_still_written_is_read_as_far_as_it_is(tmp_path):
+    path = as_db3(ros_messages(Bag(tmp_path / "bag.mcap")), tmp_path / "bag_0.db3")
+    whole = read_flight(path, VEHICLE)
+    with closing(sqlite3.connect(path)) as writer:
+        assert writer.execute("PRAGMA journal_mode=WAL").fetchone() == ("wal",)
+    before = sorted(tmp_path.iterdir())
+    read_flight(path, VEHICLE)
+    assert sorted(tmp_path.iterdir()) == before
+    with closing(sqlite3.connect(path)) as writer:
+        writer.execute("PRAGMA wal_autocheckpoint=0")
+        writer.execute("DELETE FROM messages WHERE timestamp > (SELECT avg(timestamp) FROM messages)")
+        writer.commit()
+        assert len(read_flight(path, VEHICLE)) < 0.7 * len(whole)
+
+
 def test_ros_own_messages_are_read_from_a_bag_without_definitions(tmp_path):
     path = as_db3(ros_messages(Bag(tmp_path / "bag.mcap")), tmp_path / "bag_0.db3", definitions=False)
     log = load_ros_bag(path)
