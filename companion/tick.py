@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from trueflight.companion.latest import Latest
-from trueflight.companion.law.adaptation import Told
 from trueflight.companion.odometry import Odometry
 from trueflight.companion.outcome import Outcome
 from trueflight.models.record_pb2 import Tick
@@ -53,7 +52,7 @@ def make_tick(odometry: Odometry, latest: Known, outcome: Outcome, latency: floa
         shadow=outcome.shadow,
     )
     if outcome.learning is not None:
-        set_learning(tick, outcome.learning)
+        outcome.learning.write(tick)
     if outcome.shadow:
         _set(tick.shadow_raw, outcome.shadow_raw)
     _set(tick.position, outcome.position)
@@ -79,16 +78,6 @@ def make_tick(odometry: Odometry, latest: Known, outcome: Outcome, latency: floa
         _set(tick.body_rate_command, step.command.body_rate)
         tick.thrust_command = step.thrust_command
     return tick
-
-
-def set_learning(tick: Tick, told: Told) -> None:
-    """What is learnt in flight, into a tick."""
-    tick.learning, tick.learnt_names = told.status, told.names
-    tick.learnt[:], tick.learnt_deviation[:], tick.learnt_acting[:] = (
-        told.values,
-        told.deviations,
-        told.acting,
-    )
 
 
 def _set(vector, values: tuple[float, float, float]) -> None:  # type: ignore[no-untyped-def]

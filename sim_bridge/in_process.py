@@ -312,10 +312,7 @@ class _TickWriter:
         tick.phase = "mission" if sample.mission else "takeoff"
         tick.inference = sample.inference
         if sample.learning is not None:
-            told = sample.learning
-            tick.learning, tick.learnt_names = told.status, told.names
-            tick.learnt[:], tick.learnt_deviation[:] = told.values, told.deviations
-            tick.learnt_acting[:] = told.acting
+            sample.learning.write(tick)
         self.messages.append((tick.SerializeToString(), now.time_us, host))
 
 

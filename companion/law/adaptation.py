@@ -17,10 +17,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from trueflight.companion.law.parameter_filter import ParameterFilter
 from trueflight.models.learnable import Learnable
+
+if TYPE_CHECKING:
+    from trueflight.models.record_pb2 import Tick
 
 Vector = tuple[float, float, float]
 LONGEST_STEP = 0.1
@@ -77,6 +80,13 @@ class Told(NamedTuple):
     values: tuple[float, ...]
     deviations: tuple[float, ...]
     acting: tuple[float, ...]
+
+    def write(self, tick: Tick) -> None:
+        """Into a tick of the record."""
+        tick.learning, tick.learnt_names = self.status, self.names
+        tick.learnt[:], tick.learnt_deviation[:], tick.learnt_acting[:] = (
+            self.values, self.deviations, self.acting,
+        )  # fmt: skip
 
 
 class Learning:

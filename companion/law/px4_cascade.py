@@ -50,9 +50,8 @@ class Px4Cascade:
         self._slope = LowPass(SLOPE_FREQUENCY)
         self._velocity: Vector | None = None
         self._hover = HoverThrust(law.vehicle.hover_thrust)
-        self._asked_up = self._lift = (
-            0.0  # of the last tick: acceleration up (m/s²), vertical command (normalised)
-        )
+        # Of the last tick: acceleration up (m/s²), vertical command (normalised).
+        self._asked_up = self._lift = 0.0
         self._flew = False
 
     def start(self) -> None:

@@ -42,7 +42,7 @@ class ObserverLimits:
 
 
 class MeasuredAcceleration:
-    """Acceleration in the world by the accelerometer, without its bias, and the velocity that belongs to it.
+    """Acceleration in the world by the accelerometer, without its bias.
 
     `v' = R (f - b) - g + 2 w (v_told - v)`, `b' = -w² R' (v_told - v)`: two equal poles at `bandwidth` w, rad/s. A bias
     or a tilted sensor is gone after a few 1 / w; what is faster is the accelerometer's alone.
@@ -50,8 +50,7 @@ class MeasuredAcceleration:
 
     def __init__(self, bandwidth: float) -> None:
         self._bandwidth = bandwidth
-        self.velocity: Vector | None = None
-        """m/s, world; None before the first step."""
+        self._velocity: Vector | None = None  # m/s, world
         self.trust = 0.0
         """Share to which the accelerometer is believed: as far as the velocity told agrees with it."""
         self._bias, self._force, self._same = ZERO, ZERO, 0.0
@@ -61,22 +60,22 @@ class MeasuredAcceleration:
         force, told = state.specific_force, state.velocity
         self._same = self._same + dt if force == self._force else 0.0
         if force is None or self._same > STUCK:
-            self.velocity, self.trust = None, 0.0
+            self._velocity, self.trust = None, 0.0
             return ZERO
         self._force = force
         (f, g, h), (a, b, c) = force, self._bias
         x, y, z = world_from_body(state.quaternion, (f - a, g - b, h - c))
         z -= GRAVITY
-        if self.velocity is None:
-            self.velocity, self.trust, self._bias = told, 0.0, ZERO
+        if self._velocity is None:
+            self._velocity, self.trust, self._bias = told, 0.0, ZERO
             return ZERO
         dt = min(LONGEST_STEP, max(0.0, dt))
-        u, v, w = self.velocity
+        u, v, w = self._velocity
         # Exact in the limit of small w dt, and stable for every dt up to the longest step.
         ex, ey, ez = told[0] - u - dt * x, told[1] - v - dt * y, told[2] - w - dt * z
         keep = math.exp(-self._bandwidth * dt)
         gain, learn = 1.0 - keep * keep, (1.0 - keep) * (1.0 - keep) / dt if dt > 0.0 else 0.0
-        self.velocity = u + dt * x + gain * ex, v + dt * y + gain * ey, w + dt * z + gain * ez
+        self._velocity = u + dt * x + gain * ex, v + dt * y + gain * ey, w + dt * z + gain * ez
         q = state.quaternion
         i, j, k = world_from_body((q[0], -q[1], -q[2], -q[3]), (ex, ey, ez))
         self._bias = a - learn * i, b - learn * j, c - learn * k
@@ -86,7 +85,8 @@ class MeasuredAcceleration:
 
 
 class DisturbanceObserver:
-    """One flight's: the residual, and of it what acts as a disturbance. Accelerations in m/s², heading frame."""
+    """One flight's: what is measured beyond the models, and of it what acts as a disturbance. Accelerations in m/s²,
+    heading frame."""
 
     def __init__(self, law: ControlLaw, limits: ObserverLimits) -> None:
         self._limits = limits
@@ -95,16 +95,13 @@ class DisturbanceObserver:
         self._low_pass = LowPass(limits.frequency, ZERO)
         self._thrust = law.vehicle.weight
         self._acceleration, self._lift = ZERO, 0.0
-        self.residual: Vector | None = None
-        """What the last tick's measured acceleration had beyond linear and learned model; None where none was
-        measured that is wholly believed."""
         self.pushed = ZERO
         """What of it acts, as of the last tick."""
 
     def reset(self) -> None:
         """Nothing is seen."""
         self._low_pass = LowPass(self._limits.frequency, ZERO)
-        self.residual, self.pushed = None, ZERO
+        self.pushed = ZERO
 
     def look(self, state: State, actuation: Actuation, dt: float) -> tuple[Vector, float]:
         """The acceleration now (world), as far as one is measured that can be believed, and the thrust that acts now,
@@ -120,15 +117,7 @@ class DisturbanceObserver:
     def beyond_linear(self, zeta: Vector) -> Vector | None:
         """Error acceleration (10) now: what is measured beyond the hover linearisation at attitude `zeta` (roll, pitch,
         yaw in rad) and at the thrust that acts; None where nothing is measured that is wholly believed."""
-        if self._measured.trust != 1.0:
-            return None
-        x, y, z = self._acceleration
-        c, s = math.cos(zeta[2]), math.sin(zeta[2])
-        return (
-            c * x + s * y - GRAVITY * zeta[1],
-            c * y - s * x + GRAVITY * zeta[0],
-            z + GRAVITY - self._thrust / self._mass,
-        )
+        return self._beyond(zeta) if self._measured.trust == 1.0 else None
 
     def commanded(self, thrust: float) -> None:
         """A thrust (N) goes out now."""
@@ -137,19 +126,24 @@ class DisturbanceObserver:
     def step(self, zeta: Vector, modelled: Vector, dt: float) -> tuple[Vector, Pair]:
         """What pushes, and how fast that changes along x and y (m/s³); `modelled` is what the learned model says of
         the moment of the last look, `zeta` roll, pitch, yaw in rad."""
-        (x, y, z), trust = self._acceleration, self._measured.trust
-        c, s = math.cos(zeta[2]), math.sin(zeta[2])
-        residual = (
-            c * x + s * y - trust * (GRAVITY * zeta[1] + modelled[0]),
-            c * y - s * x - trust * (modelled[1] - GRAVITY * zeta[0]),
-            z - trust * (self._thrust / self._mass - GRAVITY + modelled[2]),
-        )
-        self.residual = residual if trust == 1.0 else None
         if not self._limits.frequency:
             return ZERO, (0.0, 0.0)
+        (x, y, z), trust = self._beyond(zeta), self._measured.trust
+        u, v, w = modelled
+        x, y, z = bounded((x - trust * u, y - trust * v, z - trust * w), self._limits.authority)
         # Of what pushes most stands still in the world, so that is where it is filtered.
-        x, y, z = bounded(residual, self._limits.authority)
+        c, s = math.cos(zeta[2]), math.sin(zeta[2])
         u, v, w = self._low_pass.step((c * x - s * y, s * x + c * y, z), dt)
         self.pushed = pushed = (c * u + s * v, c * v - s * u, min(w, self._lift))
         u, v, _ = self._low_pass.slope
         return pushed, (c * u + s * v, c * v - s * u)
+
+    def _beyond(self, zeta: Vector) -> Vector:
+        """What is measured beyond the hover linearisation, as far as it is believed."""
+        (x, y, z), trust = self._acceleration, self._measured.trust
+        c, s = math.cos(zeta[2]), math.sin(zeta[2])
+        return (
+            c * x + s * y - trust * GRAVITY * zeta[1],
+            c * y - s * x + trust * GRAVITY * zeta[0],
+            z - trust * (self._thrust / self._mass - GRAVITY),
+        )
