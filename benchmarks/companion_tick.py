@@ -122,7 +122,7 @@ def tick_costs(onnx: bytes | None, ticks: int) -> dict[str, float]:
 
 
 def _open(onnx: bytes, vehicle: Any) -> Any:
-    from trueflight.companion.law.inference import check_model
+    from trueflight.companion.law.model_check import check_model
 
     verdict = check_model(onnx, vehicle)
     assert verdict.model is not None, verdict.reason

@@ -21,7 +21,8 @@ from trueflight.companion.confined import confine, leave_network
 from trueflight.models.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from trueflight.companion.law.inference import ModelInfo, Verdict
+    from trueflight.companion.law.inference import ModelInfo
+    from trueflight.companion.law.model_check import Verdict
 
 CHILD = (sys.executable, "-m", "trueflight.companion.inspection")
 PATIENCE = 30.0
@@ -120,7 +121,7 @@ def _main() -> None:
     network = leave_network()
     descriptor, whole = begin_child()
     answers = os.fdopen(descriptor, "w")
-    from trueflight.companion.law.inference import check_model, warm_up
+    from trueflight.companion.law.model_check import check_model, warm_up
 
     warm_up()
     line, _, rest = whole.partition(b"\n")

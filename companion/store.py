@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from trueflight.companion.inspection import Finding, inspect
-from trueflight.companion.law.inference import MAX_BYTES, Model, ModelInfo, open_model
+from trueflight.companion.law.inference import Model, ModelInfo
+from trueflight.companion.law.model_check import MAX_BYTES, open_model
 from trueflight.models.contract import model_hash
 from trueflight.models.errors import InputError
 from trueflight.models.vehicle import Vehicle

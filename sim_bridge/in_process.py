@@ -18,7 +18,8 @@ from trueflight.companion.law.adaptation import Told
 from trueflight.companion.law.control import ControlLaw, ControlStep, State
 from trueflight.companion.law.controllers import Preview, make_controller
 from trueflight.companion.law.guard import Guard
-from trueflight.companion.law.inference import cannot_learn, check_model
+from trueflight.companion.law.inference import cannot_learn
+from trueflight.companion.law.model_check import check_model
 from trueflight.models.contract import CORRECTED_ADAPTIVE
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS

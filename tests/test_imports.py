@@ -294,6 +294,7 @@ def test_a_comparison_is_drawn_without_torch() -> None:
     "module",
     [
         "trueflight.companion.law.inference",
+        "trueflight.companion.law.model_check",
         "trueflight.companion.inspection",
         "trueflight.groundstation.commands.app",
         "trueflight.models.export",

@@ -12,7 +12,8 @@ import numpy as np
 import onnxruntime
 
 from trueflight.companion.law.guard import ACTIVE, FADING_IN, LONGEST_STEP, TRIPPED
-from trueflight.companion.law.inference import Model, check_model
+from trueflight.companion.law.inference import Model
+from trueflight.companion.law.model_check import check_model
 from trueflight.companion.law.watch import GuardLimits, margin
 from trueflight.models import contract
 from trueflight.models.errors import InputError

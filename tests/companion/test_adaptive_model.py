@@ -10,7 +10,8 @@ import numpy as np
 import onnx
 import pytest
 
-from trueflight.companion.law.inference import Model, Runtime, _open, check_model
+from trueflight.companion.law.inference import Model, Runtime, open_session
+from trueflight.companion.law.model_check import check_model
 from trueflight.groundstation.reading import read_flight
 from trueflight.models import contract
 from trueflight.models.design import load_design
@@ -72,7 +73,7 @@ def test_straight_line_and_runtime_feel_the_same(file: bytes) -> None:
     verdict = check_model(file, VEHICLE, 1.0)
     assert verdict.model is not None
     info = verdict.model.info
-    runtime = Model(Runtime(_open(file), len(info.features), len(info.learnables)), info)
+    runtime = Model(Runtime(open_session(file), len(info.features), len(info.learnables)), info)
     row = [0.5 * (one.low + one.high) + 0.1 for one in info.features]
     numbers = [0.9, 3.0, -2.0, 0.2, 0.5]
     for ours, theirs in zip(verdict.model.sensed(row, numbers), runtime.sensed(row, numbers), strict=True):

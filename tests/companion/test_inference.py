@@ -13,7 +13,7 @@ from onnx import TensorProto, helper
 from onnx_models import RANGES, constant_model, linear_model, packed
 
 from trueflight.companion.law.actuation import Actuation
-from trueflight.companion.law.inference import MAX_BYTES, check_model, open_model, warm_up
+from trueflight.companion.law.model_check import MAX_BYTES, check_model, open_model, warm_up
 from trueflight.companion.law.watch import GuardLimits
 from trueflight.models import contract
 from trueflight.models.errors import InputError
@@ -184,7 +184,7 @@ def test_what_no_check_foresaw_is_refused_as_well(error: Exception, reason: str,
     def fails(model: object) -> None:
         raise error
 
-    monkeypatch.setattr("trueflight.companion.law.inference._check_range", fails)
+    monkeypatch.setattr("trueflight.companion.law.model_check._check_range", fails)
     verdict = check_model(constant_model(0.1, 0.0, 0.0), VEHICLE)
     assert (verdict.accepted, verdict.model, verdict.reason) == (False, None, reason)
 

@@ -12,7 +12,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from onnx_models import drag_model
 
-from trueflight.companion.law.inference import check_model
+from trueflight.companion.law.model_check import check_model
 from trueflight.companion.law.onnx_structure import why_not_self_contained
 from trueflight.models import contract
 from trueflight.models.vehicle import load_vehicle
@@ -98,7 +98,7 @@ def test_weights_in_another_file_are_refused_before_a_runtime_sees_them(
     model = onnx.ModelProto.FromString(drag_model(0.1))
     PLACES[place](model)
     monkeypatch.setattr(
-        "trueflight.companion.law.inference._open", lambda onnx: pytest.fail("a runtime saw it")
+        "trueflight.companion.law.model_check.open_session", lambda onnx: pytest.fail("a runtime saw it")
     )
     verdict = check_model(model.SerializeToString(), VEHICLE)
     assert not verdict.accepted

@@ -15,7 +15,8 @@ import pytest
 from onnx import helper
 from onnx_models import RANGES, deep_model, drag_model, linear_model, packed
 
-from trueflight.companion.law.inference import SAME, ModelInfo, Runtime, _open, check_model, open_model
+from trueflight.companion.law.inference import ModelInfo, Runtime, open_session
+from trueflight.companion.law.model_check import SAME, check_model, open_model
 from trueflight.companion.law.straight_line import NoStraightLine, StraightLine
 from trueflight.models import contract
 from trueflight.models.vehicle import load_vehicle
@@ -53,7 +54,7 @@ class Drawn:
         model = onnx.load_from_string(onnx_file)
         meta = {entry.key: entry for entry in model.metadata_props}
         golden = json.loads(meta[contract.KEY_GOLDEN_FEATURES].value)
-        delta = Runtime(_open(onnx_file), WIDTH)(golden)
+        delta = Runtime(open_session(onnx_file), WIDTH)(golden)
         meta[contract.KEY_GOLDEN_DELTA].value = json.dumps([list(row) for row in delta])
         return bytes(model.SerializeToString())
 
@@ -106,7 +107,7 @@ def test_a_straight_line_answers_as_the_runtime_does_what_is_not_finite_included
     seed: int, network: bool
 ) -> None:
     onnx_file = Drawn(seed, 14, network).file()
-    straight, runtime = StraightLine(onnx_file, WIDTH), Runtime(_open(onnx_file), WIDTH)
+    straight, runtime = StraightLine(onnx_file, WIDTH), Runtime(open_session(onnx_file), WIDTH)
     for count in (1, 3):
         rows = features(30 * count, seed)
         for begin in range(0, len(rows), count):
@@ -140,7 +141,7 @@ def test_the_check_finds_a_straight_line_where_there_is_one_and_takes_the_runtim
     model = check_model(file, VEHICLE).model
     assert model is not None and model.straight is straight
     rows = features(3)
-    np.testing.assert_allclose(model.rows(rows), Runtime(_open(file), WIDTH)(rows), atol=SAME)
+    np.testing.assert_allclose(model.rows(rows), Runtime(open_session(file), WIDTH)(rows), atol=SAME)
 
 
 def changed(file: bytes, change: Any) -> bytes:
@@ -203,7 +204,7 @@ def fading_file(
 
 def test_a_network_that_fades_is_a_straight_line_and_what_only_looks_like_one_is_not() -> None:
     rows = features(60)
-    wanted = np.array([Runtime(_open(fading_file()), WIDTH)([row])[0] for row in rows])
+    wanted = np.array([Runtime(open_session(fading_file()), WIDTH)([row])[0] for row in rows])
     np.testing.assert_allclose(StraightLine(fading_file(), WIDTH)(rows), wanted, atol=1e-4)
     assert np.any(np.all(wanted == 0.0, axis=1)) and np.any(wanted != 0.0)
     for other in (

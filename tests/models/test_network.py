@@ -13,7 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trueflight.companion.law.inference import check_model
+from trueflight.companion.law.model_check import check_model
 from trueflight.companion.law.straight_line import StraightLine
 from trueflight.models import contract
 from trueflight.models.errors import InputError
