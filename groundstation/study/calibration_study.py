@@ -25,6 +25,7 @@ import numpy as np
 
 from trueflight.groundstation.evaluate.calibration import Case
 from trueflight.groundstation.operate.processes import run_json
+from trueflight.groundstation.study.batch import Row, fly_rows
 from trueflight.groundstation.study.cases import case_from_table
 from trueflight.models.contract import LQR, LQR_INTEGRAL
 from trueflight.models.database import database
@@ -351,31 +352,26 @@ def setpoints(path: Trajectory) -> str:
 
 TOGETHER = 256
 """Flights that are flown at once; what an interruption loses at most."""
-_COLUMNS = [
-    "name",
-    "trajectory",
-    "hidden",
-    "strength",
-    "seed",
-    "noise",
-    "charge",
-    "controller",
-    "rotor_speeds",
-]
 
 
-def table_of(study: Study, some: Sequence[Sortie]) -> str:
-    """The CSV that `sim-bridge fly-many --flights` reads; setpoints lie beside it."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for sortie in some:
-        hidden = [f"{n}@{sortie.begins[n]}" if n in sortie.begins else n for n in sortie.hidden or ("none",)]
-        writer.writerow(
-            [sortie.name, f"{sortie.name}.setpoints.csv", ";".join(hidden), study.strength * sortie.strength]
-            + [sortie.seed, sortie.noise, sortie.charge, sortie.controller, str(sortie.rotor_speeds).lower()]
-        )
-    return out.getvalue()
+def flight_rows(study: Study, some: Sequence[Sortie]) -> list[Row]:
+    """Each flight as a row for `sim-bridge fly-many`; setpoints lie beside the table."""
+    return [
+        {
+            "name": sortie.name,
+            "trajectory": f"{sortie.name}.setpoints.csv",
+            "hidden": ";".join(
+                f"{n}@{sortie.begins[n]}" if n in sortie.begins else n for n in sortie.hidden or ("none",)
+            ),
+            "strength": study.strength * sortie.strength,
+            "seed": sortie.seed,
+            "noise": sortie.noise,
+            "charge": sortie.charge,
+            "controller": sortie.controller,
+            "rotor_speeds": str(sortie.rotor_speeds).lower(),
+        }
+        for sortie in some
+    ]
 
 
 def fly(
@@ -392,18 +388,13 @@ def fly(
     for begin in range(0, len(missing), TOGETHER):
         some = missing[begin : begin + TOGETHER]
         for sortie in some:
-            stem = study.folder / sortie.name
-            stem.with_suffix(".mcap").unlink(missing_ok=True)  # of a run that was killed before it could tell
-            _write(stem.with_suffix(".setpoints.csv"), setpoints(path_of(sortie, vehicle)))
-        table = study.folder / "flights.csv"
-        _write(table, table_of(study, some))
-        words: list[object] = ["sim-bridge", "fly-many", "--flights", table, "--vehicle", study.vehicle]
-        words += ["--design", study.design, "-o", study.folder, "--tell-hidden", "--jobs", jobs, "--json"]
-        reports = {report["name"]: report for report in run_json(words)["flights"]}
+            path = (study.folder / sortie.name).with_suffix(".setpoints.csv")
+            _write(path, setpoints(path_of(sortie, vehicle)))
+        more = ["--design", study.design, "--tell-hidden", "--jobs", jobs]
+        reports = fly_rows(flight_rows(study, some), study.folder, study.vehicle, *more)
         for sortie in some:
             kept[sortie.name] = told = _told(sortie, reports[sortie.name], vehicle)
             _write(study.folder / f"{sortie.name}.flight.json", json.dumps(told, indent=1))
-        table.unlink()
         done(len(some))
     return [told for told in kept.values() if told is not None]
 

@@ -6,8 +6,6 @@ to the expected *linear behaviour*, which Carvalho et al. (ICUAS 2022) report.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from trueflight.groundstation.evaluate.tracking import read_designed, track
-from trueflight.groundstation.operate.processes import run_json
+from trueflight.groundstation.study.batch import Row, fly_rows
 from trueflight.groundstation.study.disturbances import CHARGE, Disturbance
 from trueflight.groundstation.study.reproduce import (
     BOTH,
@@ -154,31 +152,15 @@ def compare_for_real(
     return cells
 
 
-def fly_table(
-    asked: Asked, rows: Sequence[dict[str, object]], folder: Path, jobs: int
-) -> dict[str, dict[str, Any]]:
-    """Fly the rows of a table (`sim-bridge fly-many --flights`) into `folder`: its report of each, by name."""
-    if not rows:
-        return {}
-    out = io.StringIO()
-    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    table = folder / "flights.csv"
-    for row in rows:  # of a run that was killed
-        (folder / f"{row['name']}.mcap").unlink(missing_ok=True)
-    write_whole(table, out.getvalue(), "the table of flights")
-    words: list[object] = ["sim-bridge", "fly-many", "--flights", table, "--vehicle", asked.vehicle]
-    words += ["--settle", SETTLE, "--jobs", jobs, "--tell-hidden", "-o", folder, "--json"]
-    reports = {report["name"]: report for report in run_json(words)["flights"]}
-    table.unlink()
-    return reports
+def fly_table(asked: Asked, rows: Sequence[Row], folder: Path, jobs: int) -> dict[str, dict[str, Any]]:
+    """Fly rows into `folder`: the simulator's report of each, by name."""
+    return fly_rows(rows, folder, asked.vehicle, "--settle", SETTLE, "--jobs", jobs, "--tell-hidden")
 
 
 def row_of(
     asked: Asked, seed: int, prepared: Prepared | None, disturbance: Disturbance, name: str, stem: str
-) -> dict[str, object]:
-    """One flight as a row of the table of `fly_table`; its record is named `stem`."""
+) -> Row:
+    """One flight as a row for `fly_table`; its record is named `stem`."""
     return {
         "name": stem,
         "seed": seed,

@@ -8,8 +8,6 @@ expected linear behaviour, as in Table I of Carvalho et al., ICUAS 2022.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +25,7 @@ from trueflight.groundstation.learn.training import train
 from trueflight.groundstation.learn.training_data import samples_of_flights
 from trueflight.groundstation.operate.processes import run_json, running_rig
 from trueflight.groundstation.reading import read_flight
+from trueflight.groundstation.study.batch import Row, fly_rows
 from trueflight.groundstation.versions.store import add_effect
 from trueflight.groundstation.views import write_tracking
 from trueflight.models.contract import CORRECTED, LQR, LQR_INTEGRAL
@@ -313,12 +312,9 @@ def fly_all(
     if missing:
         for task in missing:
             _clear(folder / _stem(*task))
-        table = folder / "flights.csv"
-        write_whole(table, table_of(prepared, truth, missing), "the table of flights")
-        words: list[object] = ["sim-bridge", "fly-many", "--flights", table, "--vehicle", vehicle]
-        words += ["--seed", prepared.seed, "--settle", SETTLE, "--jobs", jobs, "-o", folder, "--json"]
-        reports = {report["name"]: report for report in run_json(words)["flights"]}
-        table.unlink()
+        rows = flight_rows(prepared, truth, missing)
+        more = ["--seed", prepared.seed, "--settle", SETTLE, "--jobs", jobs]
+        reports = fly_rows(rows, folder, vehicle, *more)
 
     def one(task: tuple[Scenario, Arm]) -> Flown:
         scenario, arm = task
@@ -333,42 +329,29 @@ def fly_all(
         return list(pool.map(one, arms))
 
 
-def table_of(prepared: Prepared, truth: Sequence[str], tasks: Sequence[tuple[Scenario, Arm]]) -> str:
-    """The CSV that `sim-bridge fly-many --flights` reads."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(
-        [
-            "name",
-            "trajectory",
-            "set",
-            "hidden",
-            "charge",
-            "battery_age",
-            "controller",
-            "model",
-            "trim",
-            "observer",
-        ]
-    )
+def flight_rows(prepared: Prepared, truth: Sequence[str], tasks: Sequence[tuple[Scenario, Arm]]) -> list[Row]:
+    """Each flight as a row for `sim-bridge fly-many`."""
+    rows: list[Row] = []
     for scenario, arm in tasks:
         settings = (f"{key}={value:g}" for key, value in scenario.settings(prepared.seed).items())
         words = [*truth, *scenario.truth]
         told = list(zip(words[::2], words[1::2], strict=True))
-        model = (
-            prepared.files[arm.model + ("" if arm.look_ahead else " at once")].resolve() if arm.model else ""
+        model = arm.model + ("" if arm.look_ahead else " at once")
+        rows.append(
+            {
+                "name": _stem(scenario, arm),
+                "trajectory": scenario.trajectory,
+                "set": ";".join(settings),
+                "hidden": ";".join(value for option, value in told if option == "--hidden"),
+                "charge": dict(told).get("--charge", ""),
+                "battery_age": dict(told).get("--battery-age", ""),
+                "controller": arm.controller,
+                "model": prepared.files[model].resolve() if arm.model else "",
+                "trim": "" if arm.trim is None else arm.trim,
+                "observer": "" if arm.observer is None else arm.observer,
+            }
         )
-        writer.writerow(
-            [_stem(scenario, arm), scenario.trajectory, ";".join(settings)]
-            + [";".join(value for option, value in told if option == "--hidden")]
-            + [
-                next((value for option, value in told if option == name), "")
-                for name in ("--charge", "--battery-age")
-            ]
-            + [arm.controller, model]
-            + ["" if value is None else value for value in (arm.trim, arm.observer)]
-        )
-    return out.getvalue()
+    return rows
 
 
 def _stem(scenario: Scenario, arm: Arm) -> str:

@@ -34,15 +34,16 @@ from trueflight.groundstation.evaluate.calibration import (
 from trueflight.groundstation.output.as_json import calibration_table
 from trueflight.groundstation.output.calibration_tables import print_calibration
 from trueflight.groundstation.report.calibration import CHARTS, render_calibration
+from trueflight.groundstation.study.batch import table_text
 from trueflight.groundstation.study.calibration_study import (
     STRENGTHS,
     TOP,
     Study,
+    flight_rows,
     hideable,
     path_of,
     setpoints,
     sorties,
-    table_of,
 )
 from trueflight.groundstation.study.cases import begins_of, truth_of
 from trueflight.groundstation.study.logged import lagged, thinned
@@ -334,7 +335,7 @@ def test_more_flights_begin_with_the_same_and_hide_everything_equally_often(stud
         ((name, moment),) = s.begins.items()
         assert name in s.hidden and name in study.beginners
         assert 0.3 * s.seconds - 0.1 <= moment <= 0.75 * s.seconds + 0.1
-        assert f"{name}@{moment}" in table_of(study, [s])
+        assert f"{name}@{moment}" in table_text(flight_rows(study, [s]))
 
 
 def test_flights_are_long_enough_and_stay_below_the_ceiling(study: Study) -> None:

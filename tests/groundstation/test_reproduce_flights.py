@@ -4,6 +4,7 @@ from pathlib import Path
 
 from simulated import VEHICLE
 
+from trueflight.groundstation.study.batch import table_text
 from trueflight.groundstation.study.reproduce import (
     ANATOMY,
     ARMS,
@@ -11,7 +12,7 @@ from trueflight.groundstation.study.reproduce import (
     MODELS,
     SCENARIOS,
     Prepared,
-    table_of,
+    flight_rows,
 )
 from trueflight.sim_bridge.many.variations import Row, rows_of
 
@@ -19,7 +20,9 @@ from trueflight.sim_bridge.many.variations import Row, rows_of
 def test_every_flight_of_the_experiment_is_a_row(tmp_path: Path) -> None:
     files = {name: tmp_path / f"{name}.onnx" for name in (*MODELS, f"{BOTH} at once")}
     tasks = [(scenario, arm) for scenario in SCENARIOS for arm in (*ARMS, *ANATOMY[:2])]
-    (tmp_path / "flights.csv").write_text(table_of(Prepared(3, files, ()), ["--hidden", "rich"], tasks))
+    (tmp_path / "flights.csv").write_text(
+        table_text(flight_rows(Prepared(3, files, ()), ["--hidden", "rich"], tasks))
+    )
     rows = rows_of(tmp_path / "flights.csv", Row(vehicle=str(VEHICLE), seed=3, settle=4.0))
     assert len({row.name for row in rows}) == len(rows) == 42
     named = {row.name: row for row in rows}
