@@ -27,7 +27,8 @@ def reveal(file: Path, as_json: Json = False) -> None:
     lines = []
     for effect in answer["effects"]:
         numbers = (
-            f"{key} {entry['value']:.4g} {entry['unit']}" for key, entry in effect["parameters"].items()
+            f"{key} {entry['value']:.4g}" + ("" if entry["unit"] == "1" else f" {entry['unit']}")
+            for key, entry in effect["parameters"].items()
         )
         begins = f", from {effect['begins']['value']:g} s after take-off" if "begins" in effect else ""
         lines.append(f"{effect['name']}: " + ", ".join(numbers) + begins)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -82,6 +83,10 @@ def test_fly_writes_a_record_and_seals_the_answer(tmp_path: Path) -> None:
     opened = command("reveal", str(tmp_path / "one.sealed"), "--json")
     (effect,) = json.loads(opened.stdout)["effects"]
     assert effect["name"] in EFFECTS
+    words = command("reveal", str(tmp_path / "one.sealed")).stdout
+    for name, told in effect["parameters"].items():
+        unit = "" if told["unit"] == "1" else f" {told['unit']}"
+        assert f"{name} {told['value']:.4g}{unit}" in re.split(r"[:,]\s|\n", words)
     assert effect["name"] not in done.stdout + done.stderr
     before = (tmp_path / "one.sealed").read_bytes()
     again = command(*fly, "--hidden", "random", "--seed", "8", cwd=tmp_path)
