@@ -41,7 +41,7 @@ from trueflight.companion.law.geometric import Geometric
 from trueflight.companion.law.guard import Correction
 from trueflight.companion.law.indi import Indi
 from trueflight.companion.law.l1_adaptive import L1Adaptive
-from trueflight.companion.law.outer_loop import AUTHORITY, LONGEST_STEP
+from trueflight.companion.law.outer_loop import LONGEST_STEP
 from trueflight.companion.law.px4_cascade import Px4Cascade
 from trueflight.companion.law.residual import DisturbanceObserver, ObserverLimits
 from trueflight.companion.law.steps import Controller, Preview
@@ -63,7 +63,7 @@ AHEAD = 0.02
 """s over which the correction's rate of change is taken, where no lag asks for more."""
 BLIND = (LQR, LQR_INTEGRAL)
 """Those that do not look at the accelerometer, which takes time to read."""
-INTEGRAL_AUTHORITY = AUTHORITY  # m/s², the most that the integral of `lqr_integral` may ask for per axis
+INTEGRAL_AUTHORITY = 3.0  # m/s², the most that the integral of `lqr_integral` may ask for per axis
 
 
 class Corrector(Protocol):

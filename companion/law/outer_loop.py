@@ -21,8 +21,8 @@ from trueflight.models.vehicle import GRAVITY
 
 LONGEST_STEP = 0.1  # s of integration and fading in one tick, so that a gap in the odometry gives no jump
 AUTHORITY = 8.0
-"""m/s², the most that an adaptive part, or the integral of `lqr_integral`, may add on an axis of the world: as much as
-the tilt limit leaves (g tan 0.7 = 8.3), so that it is the vehicle that limits them."""
+"""m/s², the most that an adaptive part may add on an axis of the world: as much as the tilt limit leaves (g tan 0.7 =
+8.3), so that it is the vehicle that limits them."""
 
 
 class OuterLoop:
