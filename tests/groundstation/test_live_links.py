@@ -101,10 +101,17 @@ def test_a_hole_that_a_dead_router_left_is_filled_from_the_companions_record(flo
                     telemetry.tick(tick.SerializeToString())
                     time.sleep(0.0002)
 
-            send(ticks[:200])
-            wait_for(lambda: watch.seen == 200, watch.round)
+            def begin():  # what is published before the router knows who listens reaches nobody
+                send(ticks[:1])
+                watch.round()
+
+            wait_for(lambda: watch.seen > 0, begin)
+            send(ticks[1:200])
+            wait_for(lambda: watch.seen >= 200, watch.round)
             first.send_signal(signal.SIGKILL)
             first.wait()
+            watch.round()
+            seen = watch.seen
             send(ticks[200:1350])  # more than the companion keeps for a link that comes back
             second = router(endpoint)
             rest = iter(ticks[1350:])
@@ -114,7 +121,7 @@ def test_a_hole_that_a_dead_router_left_is_filled_from_the_companions_record(flo
                 time.sleep(0.1)
                 send([next(rest)])
 
-            wait_for(lambda: watch.seen > 200, go_on)
+            wait_for(lambda: watch.seen > seen, go_on)
             filled: list[dict] = []
 
             def look():
