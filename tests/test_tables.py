@@ -164,9 +164,10 @@ def test_models_against_flights(flown: Path, tmp_path: Path) -> None:
     (record,) = flown.glob("*.mcap")
     store = ("--store", tmp_path / "versions")
     assert "next: groundstation model add rotor_drag" in shown("groundstation diagnose", record, *store)
-    shown(
+    added = shown(
         "groundstation model add", "rotor_drag", "--flight", record, "--validate", flown / "table.csv", *store
     )
+    assert re.search(r"rotor_drag x = \S+ 1/s \[", added)
     told = [
         shown("groundstation diagnose", record, *store),
         shown("groundstation compare", record, *store),
@@ -178,10 +179,19 @@ def test_models_against_flights(flown: Path, tmp_path: Path) -> None:
     ]
     assert all(f"v1 (rotor_drag), fitted to {record.stem}\n" in text for text in told)
     shown("groundstation model list", *store)
-    shown("groundstation model show", "1", *store)
+    assert re.search(r"rotor_drag  x = \S+ 1/s \[", shown("groundstation model show", "1", *store))
     shown("groundstation model export", "1", "--to", "mujoco", "-o", tmp_path / "vehicle.xml", *store)
     shown("groundstation train", record, "--layers", "4", "--epochs", 1, *store)
     shown("groundstation ablate", record, "--widths", "4", "--depths", "1", "--epochs", 1, *store)
+
+
+def test_what_is_told_of_a_worst_moment_keeps_its_place_in_a_narrow_terminal(flown: Path) -> None:
+    (record,) = flown.glob("*.mcap")
+    narrow = CliRunner(env={"COLUMNS": "80"}).invoke(PROGRAMS["groundstation"], ["where", str(record)])
+    first, *rest = narrow.stdout.split("Worst moments\n")[1].splitlines()
+    place = re.search(r"m/s²  (?=height)", first)
+    assert place and any(line.startswith(" " * place.end()) for line in rest)
+    assert all(re.match(r" +\d", line) or line.startswith(" " * place.end()) for line in rest)
 
 
 def test_a_flight_planned(tmp_path: Path) -> None:

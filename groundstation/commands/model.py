@@ -152,6 +152,8 @@ def _missing(
 
 
 def _print_added(made: Model, base: Model) -> None:
+    from trueflight.groundstation.output.tables import term_numbers
+
     added = [t for t in made.terms if t.effect not in base.names() and t.values]
     if base.network is not None:
         console.print(
@@ -161,9 +163,8 @@ def _print_added(made: Model, base: Model) -> None:
             style="yellow",
         )
     for term in added:
-        for name, value in term.values.items():
-            low, high = term.intervals[name]
-            console.print(f"{term.effect} {name} = {value:.4g}  [{low:.4g}, {high:.4g}]")
+        for told in term_numbers(made, term):
+            console.print(f"{term.effect} {told}")
 
 
 @model_app.command("list")

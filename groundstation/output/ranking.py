@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from trueflight.groundstation.output.several_tables import print_several
-from trueflight.groundstation.output.tables import SAID, VERDICT_STYLE, percent
+from trueflight.groundstation.output.tables import SAID, VERDICT_STYLE, percent, unit_after
 from trueflight.groundstation.output.terminal import print_start
 from trueflight.groundstation.results import Diagnosis, EffectVerdict, Gusts
 from trueflight.models.effects import effect_named
@@ -130,7 +130,7 @@ def _numbers(e: EffectVerdict) -> list[str]:
     told = [
         f"{p.name} not determined"
         if p.name in e.undetermined
-        else f"{p.name} = {p.value:.3g}{_unit(p.unit)}  [{p.low:.3g}, {p.high:.3g}]"
+        else f"{p.name} = {p.value:.3g}{unit_after(p.unit)}  [{p.low:.3g}, {p.high:.3g}]"
         for p in e.parameters
         if not p.flight
     ]
@@ -139,10 +139,6 @@ def _numbers(e: EffectVerdict) -> list[str]:
     several = any(p.flight for p in e.parameters)
     products = [p for p in e.products if not several or "@" not in p.name]
     return told + [f"{p.name} = {p.value:.3g}  [{p.low:.3g}, {p.high:.3g}]" for p in products]
-
-
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else f" {unit}"
 
 
 def _gusts(g: Gusts) -> str:

@@ -12,8 +12,9 @@ from rich.text import Text
 
 from trueflight.groundstation.evaluate.side_by_side import SideBySide
 from trueflight.groundstation.results import Comparison, IdentifiedVehicle, WaterfallStep, WhereItFails
+from trueflight.models.effects import effect_named
 from trueflight.models.flight import Flight
-from trueflight.models.model import Model
+from trueflight.models.model import Model, Term
 from trueflight.models.terminal import Table
 
 VERDICT_STYLE = {
@@ -32,6 +33,11 @@ SAID = {
     "not_excited": "not excited",
     "not_supported": "not supported",
 }
+
+
+def unit_after(unit: str) -> str:
+    """A unit as it stands behind a number: with a blank before it, and nothing of '1'."""
+    return "" if unit == "1" else f" {unit}"
 
 
 def percent(share: float) -> str:
@@ -99,8 +105,14 @@ def print_where(console: Console, where: WhereItFails) -> None:
         console.print(f"  {region.text}")
     if where.worst:
         console.print(Text("Worst moments", style="bold"))
-    for moment in where.worst[:3]:
-        console.print(f"  {moment.start:6.1f} to {moment.end:.1f} s  {moment.rms:.2f} m/s²  {moment.text}")
+        table = Table.grid(padding=(0, 2, 0, 0))
+        for whole in (True, True, False):
+            table.add_column(no_wrap=whole)
+        for moment in where.worst[:3]:
+            table.add_row(
+                f"  {moment.start:6.1f} to {moment.end:.1f} s", f"{moment.rms:.2f} m/s²", Text(moment.text)
+            )
+        console.print(table)
 
 
 def print_waterfall(
@@ -156,13 +168,9 @@ def print_model(console: Console, model: Model) -> None:
     made = f"made {model.created}" if model.created else "not saved"
     console.print(f"{model.label} of {model.vehicle.name}, {made}, fit RMS {fit_rms(model):.3f} m/s²")
     for term in model.terms:
-        values = ", ".join(
-            f"{k} = {v:.4g} [{term.intervals[k][0]:.4g}, {term.intervals[k][1]:.4g}]"
-            if k in term.intervals
-            else f"{k} = {v:.4g}"
-            for k, v in term.values.items()
+        console.print(
+            f"  {term.effect}  {', '.join(term_numbers(model, term))}", highlight=False, markup=False
         )
-        console.print(f"  {term.effect}  {values}", highlight=False)
     if (n := model.network) is not None:
         console.print(
             f"  {n.label}  {n.parameters} parameters, recipe {n.recipe}, seed {n.seed}, hash {n.hash}; held-out RMS "
@@ -173,6 +181,16 @@ def print_model(console: Console, model: Model) -> None:
         ranges = zip(n.features, n.low, n.high, strict=True)
         told = ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges)
         console.print(f"  trained within {told}", highlight=False)
+
+
+def term_numbers(model: Model, term: Term) -> list[str]:
+    """The numbers of one of a model's effects, each with its unit and, where it was fitted, its 95 % interval."""
+    units = {p.name: p.unit for p in effect_named(term.effect, model.effects_directory).parameters}
+    return [
+        f"{name} = {value:.4g}{unit_after(units.get(name, '1'))}"
+        + (" [{:.4g}, {:.4g}]".format(*term.intervals[name]) if name in term.intervals else "")
+        for name, value in term.values.items()
+    ]
 
 
 def fit_rms(model: Model) -> float:
