@@ -45,6 +45,7 @@ from trueflight.groundstation.identify.verdicts import (
     unmeasured,
 )
 from trueflight.groundstation.measured.measurement import Measurement, measure
+from trueflight.groundstation.reading.actuation import LIFT
 from trueflight.groundstation.results import Diagnosis, EffectVerdict, OverTime
 from trueflight.models.effect import Stage
 from trueflight.models.errors import InputError
@@ -253,7 +254,25 @@ def judged(
     named, absent = judge(
         search, found, here, scale, lambda name: seen_as(problem, name, here), doubt, entire
     )
-    return with_ridges(named, ridges(entire, here, found.names)), absent
+    named = with_ridges(named, ridges(entire, here, found.names))
+    unfelt = any(
+        c.pair == LIFT and c.verdict == "weak"
+        for m in entire.flights.measurements
+        for c in m.flight.consistency
+    )
+    return [_unfelt(v) if unfelt and v.verdict == MISSING else v for v in named], absent
+
+
+def _unfelt(verdict: EffectVerdict) -> EffectVerdict:
+    """A verdict where the thrust that the model rests on is hardly felt: whatever fits may stand in for that."""
+    return replace(
+        verdict,
+        verdict=POSSIBLE,
+        rests_on="what is measured hardly follows the thrust command",
+        advice="check that command and accelerometer are of one flight and on one clock, then fly again; "
+        + verdict.advice,
+        confidence=None if verdict.confidence is None else 0.5 * verdict.confidence,
+    )
 
 
 def seen_elsewhere(

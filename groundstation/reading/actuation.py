@@ -40,6 +40,9 @@ LIFTS, TURNS = 0.3, 1.0
 """m/s² and rad/s² from which on changes of the acceleration are motion, not vibration."""
 STEERED = 0.003
 """Of full throttle; smaller changes of a motor tell nothing: some logs hold 8 bits."""
+UNMOVED, MEANT = 0.2, 0.5
+"""Share of what the thrust should bring below which it surely lifts nothing, and m/s² from which on it should bring
+something: a hover thrust wrong by a factor of three leaves more."""
 COVERED = 0.5
 """Share of what is felt below which the thrust's changes are covered by noise, gusts and manoeuvres."""
 LATEST = 0.15
@@ -74,6 +77,14 @@ class _Changes:
     def of(self, column: np.ndarray, fast: float = FAST, slow: float = SLOW) -> np.ndarray:
         """The changes of a column (N,) or (N, k) at the rows in the air."""
         return self.late(column, [0.0], fast, slow)[0]
+
+    def away_from_the_ground(self, slow: float = SLOW) -> np.ndarray:
+        """Which of the rows in the air have changes that know nothing of the ground, where thrust lifts nothing."""
+        aloft = np.zeros(len(self.t), dtype=bool)
+        for part in self.parts:
+            width = max(1, round((slow + 2.0 * LATEST) / self.dt))
+            aloft[part] = moving_mean(self.flying[part].astype(float), width) > 1.0 - 0.5 / width
+        return aloft[self.flying]
 
     def late(
         self,
@@ -137,11 +148,31 @@ def _lift(changes: _Changes, columns: Columns, vehicle: Vehicle) -> Iterator[Che
         yield Check(LIFT, "contradicts", left, text, mapping)
     elif covered and follows < FOLLOWS:
         yield Check(LIFT, "cannot tell", float("nan"), "the thrust changes too little to compare them")
+    elif follows < LITTLE and _lifts_nothing(changes, thrust, felt):
+        text = (
+            f"{what} changes by {np.nanstd(felt[0]):.2g} m/s² and knows nothing of the thrust, which should change it "
+            f"by {np.nanstd(thrust):.2g}: on the ground, held, or without propellers"
+        )
+        yield Check(LIFT, "contradicts", left, text)
     elif follows < LITTLE:
         text = f"{what} hardly follows the thrust command (correlation {follows:.2f}): what is said of thrust is weak"
         yield Check(LIFT, "weak", left, text)
     else:
         yield Check(LIFT, "agrees", left)
+
+
+def _lifts_nothing(changes: _Changes, thrust: np.ndarray, felt: list[np.ndarray]) -> bool:
+    """Whether what the thrust (M,) should bring is surely not in what is felt (M,), of several delays."""
+    aloft = changes.away_from_the_ground()
+    seconds = float(aloft.sum()) * changes.dt
+    if seconds < ENOUGH:
+        return False
+    meant, late = thrust[aloft], [one[aloft] for one in felt]
+    if not np.nanstd(meant) > MEANT:
+        return False
+    follows = max(_correlation(meant, one) for one in late)
+    most = follows + SURE / np.sqrt(max(seconds / INDEPENDENT - 3.0, 1.0))
+    return bool(np.nanstd(late[0]) / np.nanstd(meant) * most < UNMOVED)
 
 
 def _felt_along_z(t: np.ndarray, columns: Columns, sign: float) -> np.ndarray | None:

@@ -300,6 +300,7 @@ def _state(log: Dataflash) -> tuple[list[tuple[str, int, Fields]], list[str]]:
         armed += list(zip(switch.t.tolist(), state.tolist(), strict=True))
     landed = [(t, 1.0) for t in (*_events(log, LANDED), *_events(log, LANDED_MAYBE))]
     landed += [(t, 0.0) for t in _events(log, NOT_LANDED)]
+    landed += [(t, 1.0) for t in _events(log, ARMED)]  # it arms on the ground, and tells when it leaves it
     for topic, name, changes in (
         ("actuator_armed", "armed", armed),
         ("vehicle_land_detected", "landed", landed),

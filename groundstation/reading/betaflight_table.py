@@ -22,8 +22,8 @@ CONVERT = (
 )
 SCALES = 2.0 ** np.arange(8, 14)
 """Counts of a g of accelerometers that are logged raw (`acc_1G`)."""
-MOST_PULSE = 2001.0
-"""A motor's command that is larger is DShot's; so is a smallest one in the air below 1000."""
+LEAST_PULSE, MOST_PULSE = 900.0, 2001.0
+"""us; a motor's command that is larger is DShot's, and so is a smaller one that is not 0."""
 TIMES = {"time (us)": "us", "time (ms)": "ms", "time (s)": "s"}
 GRAVITIES = {"g": "g", "m/s2": "m/s^2", "m/s^2": "m/s^2"}
 
@@ -36,13 +36,15 @@ def blackbox_mapping(table: Table) -> tuple[Table, Mapping] | None:
     quantities: dict[str, dict[str, object]] = {"time": {"column": time, "unit": TIMES[time]}}
     motors = _indexed(table, "motor", 12)
     pulses = np.concatenate([table.columns[name] for name in motors])
-    kind = "dshot" if np.nanmax(pulses) > MOST_PULSE or 0 < np.nanmin(pulses) < 900.0 else "pwm"
+    given = pulses[pulses > 0.0]  # disarmed it is 0 in either unit
+    kind = "dshot" if given.size and (np.max(given) > MOST_PULSE or np.min(given) < LEAST_PULSE) else "pwm"
     quantities["motor_command"] = {"columns": motors, "unit": kind}
     for quantity, name in (("angular_velocity", "gyroADC"), ("body_rate_command", "setpoint")):
         if len(found := _indexed(table, name, 3)) == 3:
             unit = "rad/s" if "rad/s" in found[0] else "deg/s"
             quantities[quantity] = {"columns": found, "unit": unit}
-    if len(force := _indexed(table, "accSmooth", 3)) == 3:
+    force = _indexed(table, "accSmooth", 3)
+    if len(force) == 3 and any(np.any(np.isfinite(table.columns[name])) for name in force):
         told = re.search(r"\(([^)]*)\)", force[0])
         unit = GRAVITIES.get(told[1] if told else "", "")
         if not unit:

@@ -41,6 +41,8 @@ MOST_VALUES = 200_000_000
 """Numbers of a table: 1.6 GB, five hours of 100 columns at 100 Hz. A Parquet file tells before it is read."""
 MOST_RAGGED = 0.02
 """Share of lines with too few or too many values above which a file is no table."""
+WORD = re.compile(r"[A-Za-z_][\w|]*")
+"""A label, or several: FAILSAFE, GPS_FIX|GPS_FIX_HOME."""
 
 
 @dataclass(frozen=True)
@@ -270,7 +272,8 @@ def _seconds(column: Any) -> np.ndarray:
 
 
 def _reject_text(origin: str, name: str, values: list[str | None], first_line: int | None) -> None:
-    """Name the first value that is not a number; a column of texts only is a label and is left out."""
+    """Name the first value that is not a number; a column of texts only is a label and is left out, and so is one of
+    words beside a number that means none of them ("ANGLE_MODE", 0)."""
     bad = []
     for row, value in enumerate(values):
         try:
@@ -278,7 +281,8 @@ def _reject_text(origin: str, name: str, values: list[str | None], first_line: i
         except ValueError:
             bad.append((row, value))
     known = name.strip() in OWN_NAMES or name.strip() == "t"
-    if bad and (known or len(bad) < len(values) / 2):
+    label = all(WORD.fullmatch(str(text).strip()) for _, text in bad) and _at_most_one_number(values, bad)
+    if bad and (known or (len(bad) < len(values) / 2 and not label)):
         row, value = bad[0]
         place = f"line {row + first_line}" if first_line else f"row {row + 1}"
         mixed = first_line and re.fullmatch(r"[+-]?\d*[.,]\d+", str(value).strip())
@@ -286,3 +290,8 @@ def _reject_text(origin: str, name: str, values: list[str | None], first_line: i
         raise InputError(
             f"{origin}, {place}: column '{name}' holds '{value}', which is not a number{hint}; correct it"
         )
+
+
+def _at_most_one_number(values: list[str | None], bad: list[tuple[int, str]]) -> bool:
+    texts = {text for _, text in bad}
+    return len({float(value) for value in set(values) - texts if value is not None}) <= 1

@@ -102,7 +102,11 @@ def draft_vehicle(log: Log, mass: float | None = None) -> Draft:
         *_dynamics(log, simulated),
     )
     text = _text(log, lines)
-    return Draft(lines, text, vehicle_from_table(toml_table(text, "draft"), "draft"))
+    return Draft(
+        lines,
+        text,
+        vehicle_from_table(toml_table(text, "draft"), f"{log.origin}: the vehicle drafted from it"),
+    )
 
 
 def draft_of(file: Path, target: Path, mass: float | None = None) -> Draft:

@@ -1,14 +1,17 @@
 """A wrong sign or order of thrust, motors and rotors is named, in real and simulated flights."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from trueflight.groundstation.identify.translation import diagnose
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.actuation import BATTERY, LIFT, MOTORS, ROTORS, TORQUE, actuation_checks
 from trueflight.models.flight import COLUMNS, Check, Flight
+from trueflight.models.model import rigid_body_model
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 Columns = dict[str, np.ndarray]
@@ -62,6 +65,29 @@ def test_thrust_of_another_vehicle_is_told(simulated: Flight) -> None:
     good = columns_of(simulated)
     check = checked(simulated, {**good, "thrust_command": good["thrust_command"][::-1]})[LIFT]
     assert check.verdict == "weak" and "hardly follows the thrust" in check.text
+
+
+def test_a_vehicle_that_feels_nothing_of_its_thrust_is_refused(simulated: Flight) -> None:
+    """On a bench without propellers: the command is flown, the accelerometer lies still."""
+    good = columns_of(simulated, "position", "velocity")
+    still = np.tile([0.2, -0.1, 9.8], (len(simulated), 1)) + 0.05 * np.random.default_rng(1).normal(
+        size=(len(simulated), 3)
+    )
+    check = checked(simulated, {**good, "specific_force": still})[LIFT]
+    assert check.verdict == "contradicts" and "without propellers" in check.text
+    third = good["specific_force"] * [1.0, 1.0, 1.0 / 3.0]
+    assert checked(simulated, {**good, "specific_force": third})[LIFT].verdict == "agrees"
+
+
+def test_nothing_is_called_missing_where_the_thrust_is_hardly_felt(simulated: Flight) -> None:
+    """The command of other moments, and a bias that would be missing beside the right one."""
+    heavy = replace(simulated, specific_force=1.1 * simulated.specific_force)
+    assert "thrust_gain" in diagnose(heavy, rigid_body_model(heavy.vehicle)).named("missing")
+    weak = Check(LIFT, "weak", 1.0, "hardly follows")
+    found = diagnose(replace(heavy, consistency=(weak,)), rigid_body_model(heavy.vehicle))
+    assert not [e for e in found.effects if e.verdict == "missing" and e.seen_in == "acceleration"]
+    gain = next(e for e in found.effects if e.name == "thrust_gain")
+    assert gain.verdict == "possible" and "hardly follows" in gain.rests_on
 
 
 def test_motors_that_do_not_follow_the_thrust_are_told(crazyflie: Flight) -> None:

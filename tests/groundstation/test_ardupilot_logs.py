@@ -1,6 +1,7 @@
 """ArduPilot's dataflash logs: what was flown comes out as flown, whatever was logged; damage is told in one line."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import programs
@@ -93,6 +94,24 @@ def test_older_messages_are_read_as_they_were(tmp_path):
     at, there = middle_of(flight, one)
     np.testing.assert_allclose(flight.thrust_command[at], one.thrust[there], atol=0.01)
     np.testing.assert_allclose(flight.battery_voltage[at], one.voltage[there], atol=0.1)
+
+
+def test_armed_and_never_said_to_have_left_the_ground_is_no_flight(tmp_path):
+    """A copter tells when it takes off; motors that turn on a bench are armed all the same."""
+    log = copter(flown())
+    number = log.kinds["EV"][0]
+    log.rows = [row for row in log.rows if not (row[1][2] == number and row[1][-1] in (28, 18))]
+    with pytest.raises(InputError, match="never off the ground") as error:
+        read_flight(log.save(tmp_path / "bench.bin"), QUAD5)
+    assert "\n" not in str(error.value)
+
+
+def test_a_draft_that_cannot_be_names_its_log(tmp_path):
+    one = flown()
+    log = copter(replace(one, thrust=2.0 * one.thrust, specific_force=0.7 * one.specific_force))
+    with pytest.raises(InputError, match=r"fast\.bin: .*hover_thrust") as error:
+        draft_of(log.save(tmp_path / "fast.bin"), tmp_path / "vehicle.toml")
+    assert "\n" not in str(error.value)
 
 
 def test_the_core_that_flew_is_read_and_nothing_across_a_change_of_it(tmp_path):

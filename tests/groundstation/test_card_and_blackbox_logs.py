@@ -154,6 +154,34 @@ def test_blackbox_decode_makes_a_flight_of_accelerometer_and_motors(tmp_path, ra
     assert not flight.has("position")
 
 
+def test_a_blackbox_as_it_comes_from_the_converter(tmp_path):
+    """Flags in words beside a 0, motors at 0 until it is armed, DShot below all pulses, and no accelerometer."""
+    one = flown()
+    names = ["loopIteration", "time (us)", *(f"gyroADC[{i}] (deg/s)" for i in range(3)),
+             *(f"accSmooth[{i}] (g)" for i in range(3)), *(f"motor[{i}]" for i in range(4)),
+             "flightModeFlags (flags)", " stateFlags (flags)"]  # fmt: skip
+
+    def lines(force):
+        yield ", ".join(names)
+        for i, t in enumerate(one.t):
+            motor = 0 if one.thrust[i] == 0 else round(48 + 1999 * one.thrust[i])
+            numbers = [i, round(1e6 * t), *np.degrees(one.angular_velocity[i]), *force[i], *[motor] * 4]
+            flags = "GPS_FIX|GPS_FIX_HOME" if i % 3 == 0 else "0"
+            yield (
+                ", ".join(f"{n:.10g}" if np.isfinite(n) else "-nan" for n in numbers)
+                + f", ANGLE_MODE, {flags}"
+            )
+
+    path = tmp_path / "LOG00002.01.csv"
+    path.write_text("\n".join(lines(one.specific_force / GRAVITY)) + "\n")
+    flight = read_flight(path, QUAD5)
+    rows, there = middle_of(flight, one)
+    np.testing.assert_allclose(flight.thrust_command[rows], one.thrust[there], atol=1e-3)
+    path.write_text("\n".join(lines(np.full_like(one.specific_force, np.nan))) + "\n")
+    with pytest.raises(InputError, match="neither an accelerometer"):
+        read_flight(path, QUAD5)
+
+
 def test_a_blackbox_that_was_not_converted_is_told_how(tmp_path):
     path = tmp_path / "LOG00001.BFL"
     path.write_bytes(b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n")
