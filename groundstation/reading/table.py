@@ -292,6 +292,6 @@ def _reject_text(origin: str, name: str, values: list[str | None], first_line: i
         )
 
 
-def _at_most_one_number(values: list[str | None], bad: list[tuple[int, str]]) -> bool:
+def _at_most_one_number(values: list[str | None], bad: list[tuple[int, str | None]]) -> bool:
     texts = {text for _, text in bad}
     return len({float(value) for value in set(values) - texts if value is not None}) <= 1
