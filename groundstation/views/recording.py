@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 import textwrap
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +30,7 @@ def recording(path: Path, kind: str, name: str) -> Iterator[rr.RecordingStream]:
     """
     with whole_file(path, "the recording", "choose another --save") as partial:
         # Named by the flight too: two recordings of one application would be shown with the blueprint of the first.
-        stream = rr.RecordingStream(f"trueflight {kind}: {name}")
+        stream = rr.RecordingStream(_application(f"trueflight {kind}: {name}"))
         # Into memory, and from there to the disk: Rerun's own writer tells of a full disk in a log alone, and then a
         # flush never returns.
         content = stream.binary_stream()
@@ -35,6 +38,16 @@ def recording(path: Path, kind: str, name: str) -> Iterator[rr.RecordingStream]:
         yield stream
         partial.write_bytes(content.read() or b"")
         stream.disconnect()
+
+
+def _application(name: str) -> str:
+    """`name` as Rerun takes it for an application, or it warns: ASCII letters, digits and `_-:[]`, 150 at most.
+
+    Names that differ only in what is left out stay different.
+    """
+    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    plain = re.sub(r"[^\w \-:\[\]]", "-", plain, flags=re.ASCII)[:150]
+    return plain if plain == name else f"{plain[:141]} {hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def between(start: float, end: float) -> rr.TimeRange:

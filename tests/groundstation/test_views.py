@@ -23,7 +23,7 @@ from trueflight.groundstation.views import write_before_after, write_comparison,
 from trueflight.groundstation.views.colour import of_error
 from trueflight.groundstation.views.monitor import Monitor, state
 from trueflight.groundstation.views.picture import draw
-from trueflight.groundstation.views.recording import readable
+from trueflight.groundstation.views.recording import readable, recording
 from trueflight.models.errors import InputError
 from trueflight.models.model import linear_model, rigid_body_model
 from trueflight.models.record_pb2 import Event, Tick
@@ -210,6 +210,18 @@ def test_a_recording_that_cannot_be_written_is_told(flights, versions):
     comparison = compare(flights[1], versions[1], horizons=False)
     with pytest.raises(InputError, match=r"cannot write the recording.*choose another --save"):
         write_where(Path("/proc/none/where.rrd"), comparison, where_it_fails(comparison))
+
+
+@pytest.mark.parametrize(
+    "name", ["20261126-152733.123_log: v1 + rotor_drag", "Flüge/1, 2", "x" * 300, "plain-name_1: v1 [a]"]
+)
+def test_rerun_takes_the_name_of_a_recording_as_it_is(name, tmp_path, capfd):
+    told = set()
+    for other in (name, name + "+", name + ","):
+        with recording(tmp_path / "a.rrd", "waterfall", other) as stream:
+            told.add(stream.get_application_id())
+    assert len(told) == 3  # or one would be shown with the blueprint of another
+    assert capfd.readouterr().err == ""
 
 
 def test_a_recording_that_fails_halfway_leaves_nothing(tmp_path, flights, versions):
