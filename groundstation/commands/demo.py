@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
 from trueflight.models.shipped import QUAD5
 from trueflight.models.terminal import Terminal
@@ -90,9 +89,10 @@ class _Terminal:
     """The audience of a demonstration: a terminal."""
 
     def step(self, title: str, command: str) -> None:
-        """A heading."""
+        """A heading, and below it the command that does the same, whole on its line."""
         console.print("\n" + "─" * min(console.width, LINE), style="dim")
-        console.print(f"[bold]{title}[/bold]  [dim]{escape(command)}[/dim]", highlight=False)
+        console.print(title, style="bold", highlight=False, markup=False)
+        console.print(command, style="dim", highlight=False, markup=False, soft_wrap=True)
 
     def busy(self, text: str) -> AbstractContextManager[object]:
         """A line that goes away."""
@@ -109,11 +109,11 @@ class _Terminal:
         print_comparisons(console, comparisons)
         print_where(console, where)
 
-    def diagnosed(self, diagnosis: Diagnosis) -> None:
+    def diagnosed(self, diagnosis: Diagnosis, held_out: Path) -> None:
         """The tables of `diagnose`."""
         from trueflight.groundstation.output.ranking import print_diagnosis
 
-        print_diagnosis(console, diagnosis)
+        print_diagnosis(console, diagnosis, validate=held_out)
 
     def fell(self, steps: tuple[WaterfallStep, ...], fitted: str, held_out: str) -> None:
         """The table of `model add`."""

@@ -7,6 +7,7 @@ what is hidden until `sim-bridge reveal` prints it at the end.
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import time
@@ -57,8 +58,8 @@ class Audience(Protocol):
     def compared(self, comparisons: Sequence[Comparison], where: WhereItFails) -> None:
         """Models against the flight."""
 
-    def diagnosed(self, diagnosis: Diagnosis) -> None:
-        """What is missing."""
+    def diagnosed(self, diagnosis: Diagnosis, held_out: Path) -> None:
+        """What is missing; `held_out` is the file of the flight held out."""
 
     def fell(self, steps: tuple[WaterfallStep, ...], fitted: str, held_out: str) -> None:
         """The error as effects were added."""
@@ -98,7 +99,7 @@ def demonstrate(
             task = _fly(audience, link, folder, *TASK, "lqr")
             model, diagnosis, before, after, recordings = _analyse(audience, folder, vehicle, survey, task)
             corrected = _deploy_and_fly(audience, link, folder, model, survey)
-    audience.step("The answer", "sim-bridge reveal")
+    audience.step("The answer", shlex.join(["sim-bridge", "reveal", str(sealed)]))
     revealed = _reveal(sealed, hidden)
     audience.said(f"hidden was: {revealed}")
     tracking = (track_file(task), track_file(corrected))
@@ -157,17 +158,18 @@ def _analyse(
     fitted, held_out = read_flight(survey), read_flight(task)
     base = rigid_body_model(vehicle)
     store = folder / "models"
-    audience.step("Compare the model with the flight", f"groundstation compare {survey.name}")
+    files = shlex.join(map(str, (survey, "--validate", task)))
+    audience.step("Compare the model with the flight", shlex.join(["groundstation", "compare", str(survey)]))
     before = compare(fitted, base)
     audience.compared([compare(fitted, m) for m in lineage(store, base)], where_it_fails(before))
-    audience.step("Diagnose", f"groundstation diagnose {survey.name} --validate {task.name}")
+    audience.step("Diagnose", f"groundstation diagnose {files}")
     diagnosis = diagnose(fitted, base, held_out)
-    audience.diagnosed(diagnosis)
+    audience.diagnosed(diagnosis, task)
     model, parent = base, None
     for name in diagnosis.named("missing") or diagnosis.named("possible")[:1]:
         audience.step(
             f"Add {name}",
-            f"groundstation model add {name} --flight {survey.name} --validate {task.name}",
+            f"groundstation model add {name} --flight {files}",
         )
         model, path = save(store, add_effect(model, name, [fitted]), parent)
         parent = model
