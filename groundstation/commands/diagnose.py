@@ -77,8 +77,8 @@ def diagnose_command(
     if thrust not in ("command", "rotors"):
         raise InputError(f"--thrust {thrust}: choose command or rotors")
     flights = read_together(flight, vehicle, mapping)
-    held_out = None if validate is None else read_held_out(validate, flights[0], vehicle, mapping)
-    well = [read_held_out(path, flights[0], vehicle, mapping) for path in healthy or ()]
+    held_out = None if validate is None else read_held_out(validate, flights, vehicle, mapping)
+    well = [read_held_out(path, flights, vehicle, mapping) for path in healthy or ()]
 
     # dear to load, and what cannot be read is told without it
     from trueflight.groundstation.evaluate.analysis import gather

@@ -64,7 +64,7 @@ def identify_command(
     if inputs not in ("", "motors", "commands"):
         raise InputError(f"--inputs {inputs}: choose motors or commands")
     read = read_together(flights, vehicle, mapping)
-    held_out = None if validate is None else read_held_out(validate, read[0], vehicle, mapping)
+    held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
     start = choose_start(read[0], model, store, effects)
     with working(console, "identifying the vehicle", as_json) as progress:
         found = identified(read, start, held_out, inputs, find=model is None, progress=progress)

@@ -94,7 +94,7 @@ def model_add(
 
     flights = read_together(flight, vehicle, mapping)
     read = flights[-1]
-    held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
+    held_out = None if validate is None else read_held_out(validate, flights, vehicle, mapping)
     base = choose_model(read, model, store, effects)
     names = effect or _missing(
         flights, choose_start(read, model, store, effects), held_out, bandwidth, as_json

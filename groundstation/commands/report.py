@@ -74,7 +74,7 @@ def report_command(
     sections = chosen(without or ())
     together = read_together(flight, vehicle, mapping)
     read = together[-1]
-    held_out = None if validate is None else read_held_out(validate, read, vehicle, mapping)
+    held_out = None if validate is None else read_held_out(validate, together, vehicle, mapping)
     flights = told_apart([*together, *(read_beside(path, read, vehicle, mapping) for path in beside or ())])
 
     # dear to load, and what cannot be read is told without it

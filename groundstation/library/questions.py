@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from trueflight.groundstation.library.models import as_model
 from trueflight.groundstation.library.shown import answering
+from trueflight.groundstation.reading.several import check_held_out
 from trueflight.groundstation.versions.choice import choose_design, choose_line, choose_model
 from trueflight.groundstation.versions.store import DEFAULT_STORE
 from trueflight.models.design import Design
@@ -123,6 +124,8 @@ def diagnose(
     flights = [flight] if isinstance(flight, Flight) else list(flight)
     if not flights:
         raise InputError("diagnose: no flight; pass one, or several of one vehicle")
+    if validate is not None:
+        check_held_out(validate, flights)
     line = choose_line(flights[0], model, store, effects)
     found = diagnose_flights(flights, line[-1], validate, bandwidth, per_flight, shared)
     return answering(

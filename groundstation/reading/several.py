@@ -13,9 +13,29 @@ from trueflight.models.flight import Flight
 from trueflight.models.whole_file import is_hidden
 
 
-def read_held_out(path: Path, first: Flight, vehicle: Path | None = None, mapping: Given = None) -> Flight:
-    """A flight that `first` is checked on, of the same vehicle: the vehicle file of the first serves it, too."""
-    return read_flight(path, vehicle or _vehicle_file(first), mapping)
+def read_held_out(
+    path: Path, fitted: Sequence[Flight], vehicle: Path | None = None, mapping: Given = None
+) -> Flight:
+    """A flight that those `fitted` are checked on, of the same vehicle, whose vehicle file serves it, too.
+
+    Raises `InputError` as `check_held_out`.
+    """
+    flight = read_flight(path, vehicle or _vehicle_file(fitted[-1]), mapping)
+    check_held_out(flight, fitted)
+    return flight
+
+
+def check_held_out(flight: Flight, fitted: Sequence[Flight]) -> None:
+    """Raise `InputError` where `flight` is one of the `fitted`, which proves nothing, or of another vehicle."""
+    name = flight.origin or flight.name
+    for one in fitted:
+        if flight.data_hash and flight.data_hash == one.data_hash:
+            raise InputError(f"{name}: the flight that is fitted; hold out another one, or none")
+        if flight.vehicle.name != one.vehicle.name:
+            raise InputError(
+                f"{name} is of vehicle '{flight.vehicle.name}', {one.origin or one.name} of '{one.vehicle.name}'; hold "
+                "out a flight of the same vehicle"
+            )
 
 
 def read_beside(path: Path, first: Flight, vehicle: Path | None = None, mapping: Given = None) -> Flight:

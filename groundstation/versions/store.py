@@ -30,7 +30,12 @@ DEFAULT_STORE = Path("trueflight-models")
 
 
 def versions(store: Path, vehicle: str) -> list[Path]:
-    """Files of the vehicle's model versions, oldest first."""
+    """Files of the vehicle's model versions, oldest first; none of a store that is not there yet.
+
+    Raises `InputError` for a file in the place of the store.
+    """
+    if store.exists() and not store.is_dir():
+        raise InputError(f"{store}: is a file and no model store; pass its folder with --store")
     found = [p for p in (store / vehicle).glob("v*.json") if _number(p)]
     return sorted(found, key=lambda path: (_number(path), path.name))
 

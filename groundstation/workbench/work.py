@@ -28,7 +28,7 @@ from trueflight.groundstation.output.as_json import (
     where_table,
 )
 from trueflight.groundstation.reading.flight_file import NoVehicle, read_flight
-from trueflight.groundstation.reading.several import told_apart
+from trueflight.groundstation.reading.several import check_held_out, told_apart
 from trueflight.groundstation.report import charts, render, render_side_by_side, write_report
 from trueflight.groundstation.report.svg import Drawing, style, to_svg
 from trueflight.groundstation.versions.choice import choose_design, choose_line, choose_model, design_to_fly
@@ -293,7 +293,9 @@ def _flights(about: Subject) -> tuple[Flight, Flight | None]:
         return flight, None
     if held_out.vehicle is None:
         held_out = replace(held_out, vehicle=about.flight.vehicle)
-    return flight, _flight(held_out)
+    checked_on = _flight(held_out)
+    check_held_out(checked_on, [flight])
+    return flight, checked_on
 
 
 def _flight(source: Source) -> Flight:

@@ -38,7 +38,12 @@ def catalogue(directory: str | None = None) -> dict[str, Effect]:
             raise InputError(
                 f"{directory}: no such folder of effects; pass --effects DIR with *.py files in it"
             )
-        for path in sorted(folder.glob("*.py")):
+        files = sorted(folder.glob("*.py"))
+        if not files:
+            raise InputError(
+                f"{directory}: holds no effects (*.py); 'groundstation effect new NAME --output DIR' writes one"
+            )
+        for path in files:
             _add(found, _load(path), str(path))
     return found
 

@@ -1,6 +1,7 @@
 """Every bad file: exit code 2 and one line that says what, where and what to do."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 from trueflight.groundstation.commands.app import app
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.flight_file import ENDINGS
-from trueflight.groundstation.reading.several import flights_in
+from trueflight.groundstation.reading.several import check_held_out, flights_in
 from trueflight.groundstation.reading.writing import own_table
-from trueflight.models.errors import run_command_line
+from trueflight.models.errors import InputError, run_command_line
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 DRAG = SAMPLES / "rotorpy" / "rotor_drag"
@@ -329,3 +330,35 @@ def test_of_files_that_differ_in_their_ending_only_one_is_read(tmp_path):
         (tmp_path / f"one{ending}").touch()
     (tmp_path / f"two{ENDINGS[-1]}").touch()
     assert flights_in([tmp_path]) == [tmp_path / f"one{ENDINGS[0]}", tmp_path / f"two{ENDINGS[-1]}"]
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["diagnose", "report -o page.html", "identify", "model add rotor_drag --store store --flight"],
+)
+def test_a_flight_is_not_held_out_of_its_own_fit(command, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    flight = DRAG / "identify.parquet"
+    told = refused([*command.split(), flight, "--validate", flight], capsys)
+    assert "identify.parquet: the flight that is fitted; hold out another one, or none" in told
+    assert not (tmp_path / "store").exists() and not (tmp_path / "page.html").exists()
+
+
+def test_a_folder_that_holds_no_effects_and_a_file_that_is_no_store_are_told(tmp_path, capsys):
+    flight = DRAG / "identify.parquet"
+    told = refused(["diagnose", flight, "--effects", tmp_path], capsys)
+    assert f"{tmp_path}: holds no effects (*.py)" in told and "groundstation effect new" in told
+    (tmp_path / "store").write_text("")
+    told = refused(["compare", flight, "--store", tmp_path / "store"], capsys)
+    assert "is a file and no model store; pass its folder with --store" in told
+
+
+def test_a_flight_of_another_vehicle_is_not_held_out(tmp_path):
+    fitted = read_flight(DRAG / "identify.parquet")
+    other = read_flight(DRAG / "validate.parquet")
+    check_held_out(other, [fitted])
+    other = replace(other, vehicle=replace(other.vehicle, name="scout"))
+    with pytest.raises(
+        InputError, match=r"validate.parquet is of vehicle 'scout', .*identify.parquet of 'hb'"
+    ):
+        check_held_out(other, [fitted])
