@@ -88,6 +88,31 @@ def why_not_open(address: str) -> str:
     return "the machine's name is not known or there is no way to it; write its number, such as 192.168.1.10"
 
 
+def taken(address: str) -> str:
+    """'' or who else has the address open, so that it must not be opened: MAVSDK would open it all the same, and a
+    companion in flight would lose its odometry to the newcomer. Of UDP and serial; TCP refuses by itself."""
+    scheme, _, rest = address.partition("://")
+    if scheme in _SERIAL:
+        return users_of(address)
+    host, _, port = rest.rpartition(":")
+    if scheme not in ("udpin", "udp") or not re.fullmatch(r"[0-9.]*", host):
+        return ""
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind((host or "0.0.0.0", int(port)))
+    except OSError as error:
+        return _in_use(int(port), socket.SOCK_DGRAM) if error.errno == errno.EADDRINUSE else ""
+    return ""
+
+
+def _in_use(port: int, kind: int) -> str:
+    which = "-ulpn" if kind == socket.SOCK_DGRAM else "-tlpn"
+    return (
+        f"port {port} is in use by another program, such as a companion or a ground station; "
+        f"see which: ss {which} 'sport = :{port}'"
+    )
+
+
 def _why_not_device(name: str) -> str:
     try:
         handle = os.open(name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -115,11 +140,7 @@ def _why_not_port(host: str, port: int, kind: int) -> str:
             probe.bind((host, port))
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            which = "-ulpn" if kind == socket.SOCK_DGRAM else "-tlpn"
-            return (
-                f"port {port} is in use by another program, such as a companion or a ground station; "
-                f"see which: ss {which} 'sport = :{port}'"
-            )
+            return _in_use(port, kind)
         if error.errno == errno.EADDRNOTAVAIL:
             return f"{host} is no address of this machine; write 0.0.0.0 to listen on all of them"
         if error.errno in (errno.EACCES, errno.EPERM):

@@ -31,7 +31,7 @@ from mavsdk.plugins.mocap.mocap import (
 )
 from mavsdk.system import System
 
-from trueflight.companion.address import checked_address, for_mavsdk, users_of, why_not_open
+from trueflight.companion.address import checked_address, for_mavsdk, taken, why_not_open
 from trueflight.companion.arrival import Arrivals
 from trueflight.companion.batteries import Batteries
 from trueflight.companion.commands import AUTOPILOT, Commands, Parameters
@@ -57,6 +57,8 @@ _NO_MULTIROTORS = {1: "a fixed-wing", 10: "a rover", 11: "a boat", 12: "a submar
 _NO_MULTIROTORS |= dict.fromkeys(range(19, 26), "a VTOL")
 _MOST_SYSTEMS = 16  # that are counted; somebody may make up 255
 _HEARTBEATS = 2.5  # s; PX4 sends one a second
+_LEAVES = 2.0
+"""s in which a companion that was killed has left the autopilot's port to the next one."""
 
 
 class NoAutopilot(InputError):
@@ -127,6 +129,11 @@ class VehicleLink:
     def _opened(self) -> Mavsdk:
         # MAVSDK prints what it does in colour on standard output, which belongs to our caller.
         mavsdk.log_subscribe(lambda level, text, file, line: True)
+        end = time.monotonic() + _LEAVES
+        while user := taken(self.address):
+            if time.monotonic() > end:
+                raise InputError(f"cannot open {self.address}: {user}")
+            time.sleep(0.05)
         # A ground station's heartbeat would turn STATUSTEXT on, but PX4 then counts us as its data link.
         wire = Mavsdk(Configuration.create_with_component_type(mavsdk.ComponentType.COMPANION_COMPUTER))
         if wire.add_any_connection(for_mavsdk(self.address)) != mavsdk.ConnectionResult.SUCCESS:
@@ -147,11 +154,9 @@ class VehicleLink:
             self._mavsdk.destroy()
             which = f"no autopilot with system id {number}" if number else "no autopilot"
             others = f"; heard there: {', '.join(map(str, heard_ids))}" if heard_ids else ""
-            user = users_of(self.address) if self.address.startswith("serial") else ""
-            user = f"; {user}" if user else ""
             raise NoAutopilot(
                 f"{which} answering on {self.address} within {timeout:g} s{others}; start it, or pass its address "
-                f"with --connect{' and its MAV_SYS_ID with --system' if number else ''}{user}"
+                f"with --connect{' and its MAV_SYS_ID with --system' if number else ''}"
             )
         return found
 

@@ -67,13 +67,24 @@ def compare(
 def waterfall(
     fitted: Flight, held_out: Flight | None, versions: list[Model], bandwidth: float | None = None
 ) -> tuple[WaterfallStep, ...]:
-    """Residual RMS of each model version on the fitted and on the held-out flight."""
+    """Residual RMS of each model version on the fitted and on the held-out flight.
+
+    Each is named by what it has beyond the one before it.
+    """
     steps = []
-    for model in versions:
+    for k, model in enumerate(versions):
         here = compare(fitted, model, bandwidth, horizons=False)
         there = None if held_out is None else compare(held_out, model, bandwidth, horizons=False).rms
-        steps.append(WaterfallStep(model.label, here.rms, there, here.noise_floor))
+        steps.append(WaterfallStep(_step(model, versions[max(k - 1, 0)]), here.rms, there, here.noise_floor))
     return tuple(steps)
+
+
+def _step(model: Model, before: Model) -> str:
+    added = [name for name in model.names() if name not in before.names()]
+    if model.network is not None or len(added) < 2:
+        return model.label
+    told = added if len(added) < 4 else [*added[:2], f"{len(added) - 2} more"]
+    return f"{f'v{model.version} ' if model.version else ''}{' '.join(f'+ {name}' for name in told)}"
 
 
 def _predicted(measurement: Measurement, motion: Motion, chain: Chain) -> np.ndarray:

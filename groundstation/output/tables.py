@@ -119,11 +119,14 @@ def print_waterfall(
     console: Console, steps: Sequence[WaterfallStep], fitted: str, held_out: str | None
 ) -> None:
     """The error falling over the model versions, with bars."""
+    console.print(
+        f"fitted: {fitted}" + (f"; held out: {held_out}" if held_out else ""), highlight=False, markup=False
+    )
     table = Table(title="residual RMS in m/s² as effects are added")
     table.add_column("model", no_wrap=True)
-    table.add_column(f"fitted: {fitted}", justify="right", overflow="fold")
+    table.add_column("fitted", justify="right")
     if held_out:
-        table.add_column(f"held out: {held_out}", justify="right", overflow="fold")
+        table.add_column("held out", justify="right")
     table.add_column("", no_wrap=True)
     most = max(s.fitted for s in steps)
     for s in steps:

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
 from processes import with_parent
 from rig import free_port
 
@@ -85,8 +86,8 @@ def test_no_permission_is_told_with_the_group() -> None:
         assert "no permission; sudo usermod -aG dialout $USER" in said.read()
 
 
-def test_who_else_reads_a_serial_port_is_named() -> None:
-    """Of two programs that read one port each gets a part; nobody else would tell."""
+def test_a_serial_port_that_another_program_reads_is_not_opened() -> None:
+    """Of two programs that read one port each gets a part."""
     ours, theirs = pty.openpty()
     name = os.ttyname(theirs)
     sleeping = [sys.executable, "-c", "import time; time.sleep(60)"]
@@ -96,9 +97,19 @@ def test_who_else_reads_a_serial_port_is_named() -> None:
         other.terminate()
     os.close(ours)
     assert not users_of(f"serial://{name}:57600")
-    assert "no autopilot answering" in line
-    assert f"{name} is open in" in line
+    assert line.startswith(f"cannot open serial://{name}:57600: {name} is open in")
     assert f"({other.pid}) as well: end it" in line
+
+
+def test_a_port_at_which_another_companion_listens_is_not_taken_from_it() -> None:
+    """Two programs of MAVSDK's can listen at one port of UDP; the later one gets what is sent there."""
+    port = free_port()
+    first = Mavsdk(Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER))
+    assert first.add_any_connection(f"udpin://127.0.0.1:{port}") == ConnectionResult.SUCCESS
+    for address in (f"udpin://127.0.0.1:{port}", f"udpin://0.0.0.0:{port}", f"udp://:{port}"):
+        assert f"cannot open {address}: port {port} is in use by another program" in opened(address)
+    first.destroy()
+    assert "no autopilot answering" in opened(f"udpin://127.0.0.1:{port}")
 
 
 def test_a_device_with_a_colon_in_its_name_is_opened(tmp_path: Path) -> None:
