@@ -214,7 +214,7 @@ offer_version(app, "companion")
 
 def main() -> None:
     """Entry point: bad input becomes one line and exit code 2."""
-    run_command_line(app, "companion")
+    run_command_line(lambda: app(standalone_mode=False), "companion")
 
 
 if __name__ == "__main__":

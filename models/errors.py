@@ -7,6 +7,7 @@ import os
 import sys
 import unicodedata
 from collections.abc import Callable
+from typing import Any
 
 _LONGEST = 1000
 """Characters of a message; what stands in a damaged file may be of any length."""
@@ -32,16 +33,18 @@ def shown(value: object, most: int = 60) -> str:
 
 
 def run_command_line(app: Callable[[], object], extra: str = "all") -> None:
-    """Run a typer application; an `InputError` becomes one line on standard error and exit code 2.
+    """Run a typer application, called with `standalone_mode=False`; an `InputError` becomes one line on standard error
+    and exit code 2.
 
-    So do a disk that is full, whatever was being written, and a library that is not installed, for which `extra` of
-    the package is named. A terminal that cannot show a character shows the nearest that it can.
+    So do options and arguments that typer refuses, a disk that is full, whatever was being written, and a library that
+    is not installed, for which `extra` of the package is named. A terminal that cannot show a character shows the
+    nearest that it can.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors=_NEAREST)
     try:
-        app()
+        code = app()
     except InputError as error:
         _end(str(error))
     except ModuleNotFoundError as error:
@@ -57,6 +60,28 @@ def run_command_line(app: Callable[[], object], extra: str = "all") -> None:
         _end(f"{place}{error.strerror or error}; free space, or check the permissions")
     except MemoryError:
         _end("not enough memory; give fewer or shorter files")
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # typer's, which may not be loaded
+            raise
+        _refuse(error)
+    else:
+        if type(code) is int and code:
+            raise SystemExit(code)
+
+
+def _refuse(error: Any) -> None:
+    """What typer refuses: the command, what is wrong, and where it is told what would be right."""
+    message, context = str(error.format_message()), getattr(error, "ctx", None)
+    if (
+        type(error).__name__ == "NoArgsIsHelpError"
+    ):  # the help, which is printed already where it is in frames
+        if message:
+            print(message, file=sys.stderr)  # noqa: T201
+        raise SystemExit(2) from None
+    path = context.command_path if context is not None else ""
+    told = message.removeprefix("Invalid value for ").rstrip(".")
+    told = told[0].lower() + told[1:] if told[1:2].islower() else told
+    _end(f"{path}: {told}; see '{path} --help'" if path else told)
 
 
 def plain_line(message: str) -> str:

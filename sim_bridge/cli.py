@@ -26,4 +26,4 @@ offer_version(app, "sim-bridge")
 
 def main() -> None:
     """Entry point of `sim-bridge`."""
-    run_command_line(app, "sim")
+    run_command_line(lambda: app(standalone_mode=False), "sim")

@@ -30,7 +30,7 @@ def run(program: str, *arguments: object, cwd: Path | None = None) -> subprocess
         contextlib.chdir(cwd or Path.cwd()),
     ):
         try:
-            run_command_line(lambda: PROGRAMS[program](words))
+            run_command_line(lambda: PROGRAMS[program](words, standalone_mode=False))
         except SystemExit as ended:
             code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     return subprocess.CompletedProcess([program, *words], code, out.getvalue(), err.getvalue())

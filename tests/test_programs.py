@@ -1,5 +1,6 @@
 """What the three programs have in common: a version, help by task, one line where a library is missing."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -31,6 +32,34 @@ main()
 def test_every_program_tells_its_version(program: str) -> None:
     told = subprocess.run([str(BIN / program), "--version"], capture_output=True, text=True)
     assert (told.returncode, told.stdout) == (0, f"{program} {__version__}\n")
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        (
+            "groundstation diagnose x.csv --bandwidth -1",
+            "groundstation diagnose: '--bandwidth': Input should be",
+        ),
+        ("groundstation fly", "groundstation fly: missing argument 'trajectory'"),
+        ("groundstation model nope", "groundstation model: no such command 'nope'"),
+        ("companion run --nope", "companion run: no such option: --nope"),
+        ("sim-bridge fly --strength nan", "sim-bridge fly: '--strength': Input should be"),
+    ],
+)
+def test_an_option_that_cannot_be_is_one_line_at_every_width(line: str, told: str) -> None:
+    program, *words = line.split()
+    environment = {**os.environ, "COLUMNS": "40"}
+    done = subprocess.run([str(BIN / program), *words], capture_output=True, text=True, env=environment)
+    (error,) = done.stderr.splitlines()
+    assert error.startswith(f"error: {told}") and error.endswith(f"; see '{told.split(':')[0]} --help'")
+    assert (done.returncode, done.stdout) == (2, "")
+
+
+def test_a_program_alone_prints_its_help_once() -> None:
+    for program in ("groundstation", "companion", "sim-bridge"):
+        done = subprocess.run([str(BIN / program)], capture_output=True, text=True)
+        assert (done.stdout + done.stderr).count("Usage: ") == 1 and done.returncode == 2
 
 
 def test_every_command_stands_under_a_task_with_its_own_words() -> None:

@@ -19,13 +19,17 @@ from trueflight.companion import cli, onboard_commands
 from trueflight.companion.findings import DANGER, FAIL, NOTE, OK, Finding
 from trueflight.companion.preflight import Parameter, Preflight
 from trueflight.groundstation.commands import collect, compare_controllers, demo, reproduce, status
+from trueflight.groundstation.evaluate.compare import waterfall
 from trueflight.groundstation.identify.translation import diagnose
+from trueflight.groundstation.output.tables import print_waterfall
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.writing import write_flight
+from trueflight.groundstation.results import WaterfallStep
 from trueflight.groundstation.study.controllers import Cell
 from trueflight.groundstation.study.disturbances import DISTURBANCES, LIMITS
 from trueflight.groundstation.study.margins import Margin
 from trueflight.groundstation.study.reproduce import ARMS, SCENARIOS, Flown, Prepared, Study
+from trueflight.groundstation.versions.store import add_effect
 from trueflight.models.contract import CONTROLLERS
 from trueflight.models.model import rigid_body_model
 from trueflight.models.terminal import Terminal
@@ -181,7 +185,10 @@ def test_models_against_flights(flown: Path, tmp_path: Path) -> None:
     shown("groundstation model list", *store)
     assert re.search(r"rotor_drag  x = \S+ 1/s \[", shown("groundstation model show", "1", *store))
     shown("groundstation model export", "1", "--to", "mujoco", "-o", tmp_path / "vehicle.xml", *store)
-    shown("groundstation train", record, "--layers", "4", "--epochs", 1, *store)
+    trained = shown("groundstation train", record, "--layers", "4", "--epochs", 1, *store)
+    before, after = map(float, re.findall(r"all +│ +(\S+) │ +(\S+)", trained)[0])
+    assert after >= before  # one epoch on what v1 leaves, which is noise
+    assert "no better than without it: fly and diagnose without it (--model v1)" in trained
     shown("groundstation ablate", record, "--widths", "4", "--depths", "1", "--epochs", 1, *store)
 
 
@@ -192,6 +199,22 @@ def test_what_is_told_of_a_worst_moment_keeps_its_place_in_a_narrow_terminal(flo
     place = re.search(r"m/s²  (?=height)", first)
     assert place and any(line.startswith(" " * place.end()) for line in rest)
     assert all(re.match(r" +\d", line) or line.startswith(" " * place.end()) for line in rest)
+
+
+def test_the_falling_error_is_a_table_in_80_columns_whatever_flights_are_called() -> None:
+    narrow, name = Terminal(file=io.StringIO(), width=80), "20261127-200205-m1-excitation-lqr"
+    steps = [WaterfallStep("v1 + thrust_gain + rotor_drag", 0.5, 0.6, 0.05)]
+    print_waterfall(narrow, steps, name, f"another-{name}")
+    text = narrow.file.getvalue()  # type: ignore[attr-defined]
+    assert f"fitted: {name}; held out:" in text and "│ v1 + thrust_gain + rotor_drag │" in text
+
+
+def test_a_version_is_shown_with_all_that_it_has_beyond_the_one_before() -> None:
+    flight = read_flight(ROOT / "samples" / "rotorpy" / "rotor_drag" / "validate.parquet")
+    base = rigid_body_model(flight.vehicle)
+    two = add_effect(base, ["rotor_drag", "thrust_gain"], [flight])
+    labels = [step.label for step in waterfall(flight, None, [base, two])]
+    assert labels == ["+ rigid_body", "+ rotor_drag + thrust_gain"]
 
 
 def test_a_flight_planned(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ def main() -> None:
     """Entry point of the `groundstation` program."""
     # before numpy is loaded; identify/translation.py tells why
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    run_command_line(app, "ground")
+    run_command_line(lambda: app(standalone_mode=False), "ground")
 
 
 if __name__ == "__main__":

@@ -275,6 +275,14 @@ def _print_training(done: Training, samples: Samples, base: Model) -> None:
         style="bold",
     )
     console.print(table)
+    if fit["validation_rms"] >= fit["before_rms"]:
+        without = f"--model v{base.version}" if base.version else "--model with one that has none"
+        console.print(
+            "the network predicts held-out flight no better than without it: fly and diagnose without it "
+            f"({without}), or train on more",
+            style="yellow",
+            highlight=False,
+        )
     _print_remarks(done, samples, base)
 
 
