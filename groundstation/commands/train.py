@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -275,15 +275,20 @@ def _print_training(done: Training, samples: Samples, base: Model) -> None:
         style="bold",
     )
     console.print(table)
-    if fit["validation_rms"] >= fit["before_rms"]:
-        without = f"--model v{base.version}" if base.version else "--model with one that has none"
-        console.print(
-            "the network predicts held-out flight no better than without it: fly and diagnose without it "
-            f"({without}), or train on more",
-            style="yellow",
-            highlight=False,
-        )
+    if told := no_help(fit, base):
+        console.print(told, style="yellow", highlight=False)
     _print_remarks(done, samples, base)
+
+
+def no_help(fit: Mapping[str, float], base: Model) -> str:
+    """'' or, of a network that predicts held-out flight no better than `base` alone, what to fly instead."""
+    if fit["validation_rms"] < fit["before_rms"]:
+        return ""
+    without = f"--model v{base.version}" if base.version else "--model linear, or a version that has none"
+    return (
+        "the network predicts held-out flight no better than without it: fly and diagnose without it "
+        f"({without}), or train on more"
+    )
 
 
 def _print_remarks(done: Training, samples: Samples, base: Model) -> None:
