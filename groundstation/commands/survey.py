@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -59,17 +60,19 @@ def survey_command(
     """Diagnose every flight of a folder: how often each effect is missing, its spread over the fleet, its trend.
 
     The flights of each vehicle are then fitted together, and what has changed since the last good flight is told. A
-    file that cannot be used is told and skipped. `--save` writes survey.jsonl (one line a flight, as they are done),
-    survey.parquet and fleet.json.
+    file that cannot be used is told and skipped, files that are no logs are counted. `--save` writes survey.jsonl (one
+    line a flight, as they are done), survey.parquet and fleet.json.
     """
     from trueflight.groundstation.evaluate.survey import (
         fleet_of,
         histories,
+        passed_over,
         row_table,
         stamp_of,
         survey,
         survey_files,
     )
+    from trueflight.groundstation.evaluate.time_left import TimeLeft, in_words, kind_of
     from trueflight.groundstation.identify.ownership import ownership
     from trueflight.groundstation.output.as_json import fleet_table, plain
     from trueflight.groundstation.output.survey_tables import print_survey
@@ -82,8 +85,11 @@ def survey_command(
     done = {(row.file, row.stamp) for row in known}
     left = [f for f in files if (str(f.resolve()), stamp_of(f)) not in done]
     rows = list(known)
-    with keeping(save, new=not known) as keep, counted(as_json) as bar:
-        task = bar.add_task("starting", total=len(files), completed=len(known))
+    others = passed_over(folder, save)
+    kinds = {str(f.resolve()): kind_of(f) for f in left}
+    time_left, began = TimeLeft(list(kinds.values())), time.monotonic()
+    with keeping(save, new=not known) as keep, counted(as_json, own_estimate=True) as bar:
+        task = bar.add_task("starting", total=len(files), completed=len(known), left=in_words(None))
 
         def tell(what: str) -> None:
             bar.update(task, description=what)
@@ -91,19 +97,20 @@ def survey_command(
         for row in survey(left, vehicle, mapping, effects, jobs, memory, scheduler, tell):
             rows.append(row)
             keep(row)
-            bar.advance(task)
+            time_left.done(kinds[row.file], row.seconds)
+            bar.update(task, advance=1, left=in_words(time_left.left(time.monotonic() - began)))
         rows.sort(key=lambda row: row.file)
-        tell("fitting the flights of each vehicle together")
+        bar.update(task, description="fitting the flights of each vehicle together", left="")
         together = (
             [] if each_alone else histories(rows, vehicle, mapping, effects, jobs, memory, scheduler, own)
         )
-    fleet = fleet_of(rows, together)
+    fleet = fleet_of(rows, together, len(others))
     if save is not None:
         write_survey(save, rows, fleet)
     if as_json:
         print_json(plain({"flights": [row_table(r) for r in rows], "fleet": fleet_table(fleet)}))
     else:
-        print_survey(console, rows, fleet, folder)
+        print_survey(console, rows, fleet, folder, others)
         if save is not None:
             console.print(f"saved in {save}: survey.jsonl, survey.parquet, fleet.json", highlight=False)
     if fleet.failed == fleet.flights:

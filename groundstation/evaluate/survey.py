@@ -19,9 +19,10 @@ import numpy as np
 from scipy import stats
 
 from trueflight.groundstation.evaluate.history import Flown, History, history_of
+from trueflight.groundstation.evaluate.time_left import mixed
 from trueflight.groundstation.reading.flight_file import ENDINGS
 from trueflight.groundstation.reading.mapping import Given, absolute
-from trueflight.groundstation.reading.several import flight_files
+from trueflight.groundstation.reading.several import flight_files, other_files
 from trueflight.models.errors import InputError
 from trueflight.models.outside import is_number
 from trueflight.models.whole_file import whole_file
@@ -103,7 +104,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Fleet:
-    """What holds of all flights together."""
+    """What holds of all flights together; `passed_over` counts the files beside them that are no logs."""
 
     flights: int
     failed: int
@@ -113,6 +114,7 @@ class Fleet:
     effects: tuple[HowOften, ...]
     parameters: tuple[Spread, ...]
     histories: tuple[History, ...] = ()
+    passed_over: int = 0
 
 
 def survey_files(folder: Path) -> list[Path]:
@@ -123,7 +125,20 @@ def survey_files(folder: Path) -> list[Path]:
     return files
 
 
+def passed_over(folder: Path, save: Path | None = None) -> list[Path]:
+    """The files below `folder` that are taken for no logs: neither by their ending nor, without one, by how they begin.
+    Vehicle files, mappings and what a survey left in `save` are not among them."""
+    return [
+        file
+        for file in other_files(folder)
+        if not file.name.endswith(BESIDE)
+        and not (file.name in SAVED and save is not None and file.parent.samefile(save))
+    ]
+
+
 SAVED_TABLE = "survey.parquet"
+SAVED = ("survey.jsonl", SAVED_TABLE, "fleet.json")
+BESIDE = ("vehicle.toml", "mapping.toml")
 
 
 _Task = tuple[str | None, list[str], str | None]
@@ -141,9 +156,9 @@ def survey_flight(file: str, vehicle: str | None, mapping: list[str], effects: s
         flight = read_flight(path, vehicle, mapping)
         d = diagnose(flight, rigid_body_model(flight.vehicle, effects))
     except InputError as error:
-        return _failed(row, str(error))
+        return _failed(row, str(error), begin)
     except Exception as error:  # noqa: BLE001 - one bad file must not end an analysis of a thousand
-        return _failed(row, f"{path}: {type(error).__name__}: {error}")
+        return _failed(row, f"{path}: {type(error).__name__}: {error}", begin)
     return Row(
         file,
         row.stamp,
@@ -165,8 +180,10 @@ def survey_flight(file: str, vehicle: str | None, mapping: list[str], effects: s
     )
 
 
-def _failed(row: Row, why: str) -> Row:
-    return Row(row.file, row.stamp, row.day, error=" ".join(why.split()) or "unknown error")
+def _failed(row: Row, why: str, begin: float | None = None) -> Row:
+    seconds = 0.0 if begin is None else time.perf_counter() - begin
+    why = " ".join(why.split()) or "unknown error"
+    return Row(row.file, row.stamp, row.day, error=why, seconds=seconds)
 
 
 def stamp_of(path: Path) -> str:
@@ -203,14 +220,14 @@ def survey(
     scheduler: str | None = None,
     ready: Callable[[str], None] = lambda _: None,
 ) -> Iterator[Row]:
-    """Diagnose the files, in the order in which they are done.
+    """Diagnose the files, in the order in which they are done: a mixed one, of which every beginning is like the whole.
 
     With `jobs` 1 here; otherwise in so many processes of Dask (0: one a core), each held to `memory`, or by the workers
     of the cluster at `scheduler`, which must see the files under the same paths. `ready` is told where one can watch.
     """
     believed, own = (None if p is None else str(p.resolve()) for p in (vehicle, effects))
     task: _Task = (believed, absolute(mapping), own)
-    names = [str(f.resolve()) for f in files]
+    names = [str(f.resolve()) for f in mixed(files)]
     if scheduler is None and (jobs == 1 or len(files) == 1):
         for name in names:
             yield survey_flight(name, *task)
@@ -331,8 +348,8 @@ def _surveyed(client: Client, names: list[str], task: _Task) -> Iterator[Row]:
 # --- the fleet ------------------------------------------------------------------------------------------------
 
 
-def fleet_of(rows: Sequence[Row], told: Sequence[History] = ()) -> Fleet:
-    """What holds of all flights together; `told` are the histories of the vehicles."""
+def fleet_of(rows: Sequence[Row], told: Sequence[History] = (), others: int = 0) -> Fleet:
+    """What holds of all flights together; `told` are the histories of the vehicles, `others` the files passed over."""
     good = [r for r in rows if not r.error]
     names = list(dict.fromkeys(name for r in good for name in r.verdicts))
     often = [_how_often(name, good) for name in names]
@@ -347,6 +364,7 @@ def fleet_of(rows: Sequence[Row], told: Sequence[History] = ()) -> Fleet:
         effects=tuple(often),
         parameters=tuple(_spread(effect, parameter, good) for effect, parameter in keys),
         histories=tuple(told),
+        passed_over=others,
     )
 
 

@@ -51,7 +51,8 @@ class MeasuredRotors(MeasuredFlights):
     def _measured(self) -> np.ndarray:
         parts = []
         for m, motion in zip(self.measurements, self.motions, strict=True):
-            total = np.sum(motion.rotor_speed**2, axis=1)
+            # the flight's, not the motion's: a vehicle file need not say where the rotors are
+            total = np.sum(np.square(m.flight.column("rotor_speed")), axis=1)
             scale = float(np.mean(motion.command[m.rows][m.used]) / np.mean(total[m.rows][m.used]))
             parts.append(m.smooth((scale * total)[:, None])[m.used])
         return np.concatenate(parts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -11,14 +11,21 @@ from rich.markup import escape
 from trueflight.groundstation.evaluate.history import History
 from trueflight.groundstation.evaluate.survey import Fleet, Row
 from trueflight.groundstation.output.tables import percent
+from trueflight.groundstation.reading.betaflight_table import BLACKBOX, CONVERT
 from trueflight.models.terminal import Table
 
 SHOWN = 40
 """Flights in the table of a terminal; all are in what `--save` and `--json` give."""
 
 
-def print_survey(console: Console, rows: Sequence[Row], fleet: Fleet, folder: Path) -> None:
-    """Flights, effects and parameters."""
+NAMED = 3
+"""Files that are no logs whose names are told; those without an ending first, which may be damaged logs of a card."""
+
+
+def print_survey(
+    console: Console, rows: Sequence[Row], fleet: Fleet, folder: Path, others: Sequence[Path] = ()
+) -> None:
+    """Flights, effects and parameters; `others` are the files of the folder that are no logs."""
     _print_flights(console, rows, folder)
     usable = fleet.flights - fleet.failed
     console.print(
@@ -27,10 +34,26 @@ def print_survey(console: Console, rows: Sequence[Row], fleet: Fleet, folder: Pa
         f"{fleet.clean} lack nothing, {fleet.unexplained} hold something that no effect explains",
         highlight=False,
     )
+    for line in _told(others, folder):
+        console.print(f"[dim]{escape(line)}[/dim]", highlight=False)
     for h in fleet.histories:
         _print_history(console, h)
     _print_effects(console, fleet)
     _print_parameters(console, fleet)
+
+
+def _told(others: Sequence[Path], folder: Path) -> Iterator[str]:
+    """How many files are no logs, and how many are to be converted first."""
+    raw = [f for f in others if f.suffix.lower() in BLACKBOX]
+    if raw:
+        counted = f"{raw[0].relative_to(folder)} is" if len(raw) == 1 else f"{len(raw)} files are"
+        yield f"{counted} {CONVERT}"
+    rest = sorted((f for f in others if f not in set(raw)), key=lambda f: (f.suffix != "", f))
+    if rest:
+        names = ", ".join(str(f.relative_to(folder)) for f in rest[:NAMED])
+        more = f" and {len(rest) - NAMED} more" if len(rest) > NAMED else ""
+        what = "1 file is no log" if len(rest) == 1 else f"{len(rest)} files are no logs"
+        yield f"{what}, by ending and beginning, and passed over: {names}{more}"
 
 
 def _print_history(console: Console, h: History) -> None:

@@ -76,13 +76,14 @@ def working(console: Console, what: str, quiet: bool) -> Iterator[Callable[[str]
         yield lambda text: status.update(text)
 
 
-def counted(quiet: bool) -> Progress:
-    """A bar on standard error for work in countable pieces; gone when it is done, and never there if `quiet`."""
+def counted(quiet: bool, own_estimate: bool = False) -> Progress:
+    """A bar on standard error for work in countable pieces; gone when it is done, and never there if `quiet`. With
+    `own_estimate` each task tells the time left as its field `left`, for pieces that differ much."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TimeRemainingColumn(),
+        TextColumn("{task.fields[left]}") if own_estimate else TimeRemainingColumn(),
         console=Terminal(stderr=True),
         disable=quiet,
         transient=True,

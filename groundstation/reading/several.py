@@ -96,6 +96,13 @@ def flight_files(folder: Path) -> list[Path]:
     )
 
 
+def other_files(folder: Path) -> list[Path]:
+    """Every file below `folder` that is not taken for a flight, sorted; hidden ones are none."""
+    return sorted(
+        f for f in folder.rglob("*") if f.is_file() and not is_flight_file(f) and not is_hidden(f, folder)
+    )
+
+
 def _one_each(folder: Path) -> list[Path]:
     """The flights of a folder, one file each."""
     found: dict[Path, Path] = {}

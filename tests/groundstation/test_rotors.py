@@ -196,3 +196,11 @@ def test_a_centre_of_mass_beside_a_lack_of_thrust_may_be_one_weaker_rotor() -> N
     assert other == found[2]
     assert com.confidence == 0.5
     assert or_a_rotor(found, {"com_offset": ()}) == found
+
+
+def test_rotor_speeds_are_read_where_the_vehicle_file_does_not_say_where_the_rotors_are() -> None:
+    craft = vehicle(4)
+    flight = flown(craft, seed=1)
+    bare = replace(flight, vehicle=replace(craft, rotor_positions=(), rotor_directions=()))
+    found = diagnose(bare, rigid_body_model(bare.vehicle))
+    assert not np.isnan(found.rms_after)

@@ -49,6 +49,10 @@ def folder(tmp_path_factory):
     (root / "notes.csv").write_text("t,position_x\n0,nonsense\n")
     cut = (root / "one" / "2026-05-01.mcap").read_bytes()[:2500]
     (root / "two" / "cut.mcap").write_bytes(cut)
+    # a card's log whose beginning is damaged, and a photograph: nothing tells that they are logs
+    (root / "two" / "log00").write_bytes(b"\x00\x01\x02" + bytes(500))
+    (root / "photo.jpg").write_bytes(b"no log")
+    (root / "LOG00001.BFL").write_bytes(b"H Product:Blackbox flight data recorder by Nicholas Sherlock")
     return root
 
 
@@ -73,6 +77,8 @@ def test_every_flight_is_a_row_and_a_bad_file_is_skipped(folder, tmp_path, capsy
     assert all("\n" not in r["error"] for r in failed)
     fleet = result["fleet"]
     assert (fleet["flights"], fleet["failed"], fleet["vehicles"]) == (12, 2, ["one", "two"])
+    assert fleet["passed_over"] == 3
+    assert all(r["seconds"] > 0.0 for r in result["flights"])
     drag = next(e for e in fleet["effects"] if e["effect"] == "rotor_drag")
     assert drag["counts"]["missing"] >= 9
     spread = next(p for p in fleet["parameters"] if (p["effect"], p["parameter"]) == ("rotor_drag", "x"))
@@ -98,6 +104,9 @@ def test_every_flight_is_a_row_and_a_bad_file_is_skipped(folder, tmp_path, capsy
     assert code == 0
     assert len(seen) < 8
     assert "10 of 12 flights could be used, of 2 vehicles" in " ".join(out.split())
+    said = " ".join(out.split())
+    assert "2 files are no logs, by ending and beginning, and passed over: two/log00, photo.jpg" in said
+    assert "LOG00001.BFL is a Betaflight blackbox: convert it by `blackbox_decode" in said
 
 
 def test_a_worker_that_dies_costs_its_file_only(folder, tmp_path, monkeypatch) -> None:
