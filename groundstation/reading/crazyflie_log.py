@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from trueflight.groundstation.reading.mapping import Mapping
+from trueflight.groundstation.reading.rows import possible
 from trueflight.groundstation.reading.table import Table
 from trueflight.models.errors import InputError
 from trueflight.models.outside import unreadable
@@ -145,7 +146,7 @@ def _joined(raw: np.ndarray, events: list[Event], head: int, unit: float) -> dic
         rows = raw[places[:, None] + head + np.arange(event.row.itemsize)].copy().view(event.row)[:, 0]
         for i, name in enumerate(event.variables):
             with np.errstate(invalid="ignore"):  # a damaged file holds what is no number
-                column = rows[str(i)].astype(float)
+                column = possible(rows[str(i)].astype(float))
             if name == "stateEstimateZ.quat":
                 for letter, part in zip("xyzw", _unpacked(rows[str(i)].astype(np.uint64)).T, strict=True):
                     columns.setdefault(f"{name}.{letter}", part if t is clock else np.interp(clock, t, part))

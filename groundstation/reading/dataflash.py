@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from trueflight.groundstation.reading.rows import possible
 from trueflight.models.errors import InputError
 
 START, FORMAT, FORMAT_LENGTH = b"\xa3\x95", 0x80, 89
@@ -111,7 +112,8 @@ class Dataflash:
         fields, whole = {}, set()
         for i, column in enumerate(form.columns[: len(form.msg_mults)]):
             factor = form.msg_mults[i]
-            fields[column] = raw[f"f{i}"] if factor is None else raw[f"f{i}"] * factor
+            values = possible(raw[f"f{i}"])
+            fields[column] = values if factor is None else values * factor
             if factor is None and fields[column].dtype.kind in "iu":
                 whole.add(column)
         for column, unit in TIMES:

@@ -20,6 +20,7 @@ from trueflight.groundstation.reading import ardupilot_log
 from trueflight.groundstation.reading.ardupilot_motors import frame_of, of_pulses
 from trueflight.groundstation.reading.px4_airborne import MOTORS
 from trueflight.groundstation.reading.px4_log import MODES, Fields, Frame, Log, collect
+from trueflight.groundstation.reading.rows import as_us, possible
 from trueflight.groundstation.reading.sources import Sources
 from trueflight.models.errors import InputError
 from trueflight.models.frames import quaternion_from_euler
@@ -67,7 +68,7 @@ class Received:
 
     def column(self, name: str) -> np.ndarray:
         """A field (M,) as floats."""
-        return np.array([float(row[name]) for row in self.rows])
+        return possible(np.array([float(row[name]) for row in self.rows]))
 
     def stack(self, *names: str) -> np.ndarray:
         """Fields as columns (M, k)."""
@@ -248,9 +249,9 @@ def _stamp(one: Received, clock: float, known: bool) -> np.ndarray:
     received = np.array(one.received, dtype=float) - clock
     own = _own(one) if known else None
     if own is None:
-        return received.astype(np.int64)
+        return as_us(received)
     apart = float(np.median(received - own))
-    return (own + (apart if abs(apart) > 1e6 * APART else 0.0)).astype(np.int64)
+    return as_us(own + (apart if abs(apart) > 1e6 * APART else 0.0))
 
 
 Made = list[tuple[str, int, Fields]]

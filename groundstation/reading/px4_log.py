@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from trueflight.groundstation.reading.rows import as_us, possible
 from trueflight.groundstation.reading.sources import FROM, Sources
 from trueflight.models.errors import InputError
 from trueflight.models.outside import unreadable
@@ -277,7 +278,9 @@ def collect(parts: Iterable[tuple[str, int, dict[str, Any]]]) -> dict[str, tuple
     for (name, instance), pieces in sorted(joined.items(), key=lambda item: item[0]):
         shared = set.intersection(*(set(piece) for piece in pieces))
         fields = {
-            key: np.concatenate([np.asarray(p[key]) for p in pieces]) for key in pieces[0] if key in shared
+            key: possible(np.concatenate([np.asarray(p[key]) for p in pieces]))
+            for key in pieces[0]
+            if key in shared
         }
         if len(pieces) > 1:
             order = np.argsort(fields["timestamp"], kind="stable")
@@ -309,8 +312,10 @@ def _selected(topics: dict[str, tuple[Topic, ...]]) -> tuple[dict[str, tuple[Top
 
 
 def _topic(name: str, instance: int, fields: dict[str, np.ndarray]) -> Topic | None:
-    stamp = np.asarray(fields["timestamp"], dtype=np.int64)
-    sample = np.asarray(fields.get("timestamp_sample", np.zeros_like(stamp)), dtype=np.int64)
+    stamp, sample = (
+        as_us(t) if t.dtype.kind == "f" else t.astype(np.int64)
+        for t in (fields["timestamp"], fields.get("timestamp_sample", np.zeros(len(fields["timestamp"]))))
+    )
     # The time of measurement, where it is known and sane; the time of publication otherwise.
     if np.all(sample > 0) and np.max(np.abs(stamp - sample), initial=0) < 1_000_000:
         stamp = sample

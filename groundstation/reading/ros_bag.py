@@ -27,6 +27,7 @@ from trueflight.groundstation.reading.clocks import drift_of, of_one_clock
 from trueflight.groundstation.reading.px4_log import TOPICS, Log, collect
 from trueflight.groundstation.reading.ros_choice import choose
 from trueflight.groundstation.reading.ros_vehicles import Fields, Source
+from trueflight.groundstation.reading.rows import possible
 from trueflight.groundstation.reading.sources import Sources
 from trueflight.groundstation.reading.uniform import continuous_quaternion
 from trueflight.models.errors import InputError
@@ -58,7 +59,11 @@ class _Recorded:
 
     def columns(self) -> dict[str, np.ndarray]:
         """Fields (M,) by name."""
-        return dict(zip(self.names, np.array(self.rows, dtype=float).T, strict=True)) if self.rows else {}
+        return (
+            dict(zip(self.names, possible(np.array(self.rows, dtype=float)).T, strict=True))
+            if self.rows
+            else {}
+        )
 
 
 def is_ros_bag(path: Path) -> bool:

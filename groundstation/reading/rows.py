@@ -27,6 +27,9 @@ HELD = (
 )
 """Columns that loggers write at a lower rate than the others: their last value is held."""
 
+MOST, MOST_US = 1e18, 4e18
+"""What no number of a log reaches, and no time in us that 64 bits hold."""
+
 
 def in_order(
     t: np.ndarray, columns: dict[str, np.ndarray]
@@ -121,7 +124,23 @@ def _filled(t: np.ndarray, column: np.ndarray, missing: np.ndarray) -> tuple[np.
 
 def whole(column: np.ndarray) -> np.ndarray:
     """In which rows of a column (N,) or (N, k) all numbers are finite, (N,)."""
-    return np.isfinite(column if column.ndim == 1 else sum(column.T))
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.isfinite(column if column.ndim == 1 else sum(column.T))
+
+
+def possible(column: np.ndarray) -> np.ndarray:
+    """A column (N,) as a log holds it, with NaN for what damage alone makes: what is infinite, beyond `MOST`, or a NaN
+    that signals, of which numpy warns where it is used. Whole numbers, and texts, are as they are."""
+    if column.dtype.kind != "f":
+        return column
+    with np.errstate(invalid="ignore", over="ignore"):
+        good = np.abs(column) < MOST
+        return column if np.all(good) else np.where(good, column, column.dtype.type(np.nan))
+
+
+def as_us(t: np.ndarray) -> np.ndarray:
+    """Times (N,) in us as whole numbers; -1 where one cannot be a time."""
+    return np.where(np.abs(t) < MOST_US, t, -1.0).astype(np.int64)
 
 
 def held(column: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from trueflight.groundstation.reading.csv_text import read_csv_text
+from trueflight.groundstation.reading.rows import possible
 from trueflight.models.errors import InputError
 from trueflight.models.flight import COLUMNS, MOST_ROTORS, column_names
 from trueflight.models.outside import shown, unreadable
@@ -234,7 +235,8 @@ def _numbers(origin: str, arrow: object, first_line: int | None) -> dict[str, np
         ):
             continue
         clean = name.strip().lstrip("#").strip()
-        columns[clean] = _floats(column if not pa.types.is_boolean(column.type) else column.cast(pa.int8()))
+        numbers = column.cast(pa.int8()) if pa.types.is_boolean(column.type) else column
+        columns[clean] = possible(_floats(numbers))
     if not columns or len(next(iter(columns.values()))) == 0:
         raise InputError(
             f"{origin}: no rows of numbers in it; a header line and one row for each sample are needed"

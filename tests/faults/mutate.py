@@ -1,7 +1,8 @@
 """Damaged files by the thousand through every reader, in-process, with a fixed seed and a time limit for each.
 
-A reader may take a file or refuse it in one line (`InputError`); anything else is a failure: another exception, more
-processor time than `SECONDS`, or more memory than `MEMORY`. `run` is for the campaign; alone:
+A reader may take a file or refuse it in one line (`InputError`); anything else is a failure: another exception, a
+warning of numpy's beside the line, more processor time than `SECONDS`, or more memory than `MEMORY`. `run` is for the
+campaign; alone:
 
     python tests/faults/mutate.py --count 100000 --seed 1
 """
@@ -22,8 +23,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-
-import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -100,7 +99,9 @@ def _one(reader: Reader, number: int, content: bytes, path: Path, figures: Figur
     begun = _processor_time()
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
-        reader.read(path)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", RuntimeWarning)
+            reader.read(path)
     except InputError as error:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         if isinstance(error.__cause__, MemoryError):
@@ -118,6 +119,9 @@ def _one(reader: Reader, number: int, content: bytes, path: Path, figures: Figur
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         took = _processor_time() - begun
         figures.slowest[reader.name] = max(took, figures.slowest.get(reader.name, 0.0))
+    if said:
+        first = said[0]
+        return Failure(reader.name, number, f"warns: {first.message}", f"{first.filename}:{first.lineno}")
     return None
 
 
@@ -148,7 +152,6 @@ class _limits:
 
         self._handler = signal.signal(signal.SIGPROF, up)
         self._memory = resource.getrlimit(resource.RLIMIT_AS)
-        self._numbers = np.seterr(all="ignore")
         self._warnings = warnings.catch_warnings()
         self._warnings.__enter__()
         warnings.simplefilter("ignore")
@@ -160,7 +163,6 @@ class _limits:
     def __exit__(self, *_: object) -> None:
         resource.setrlimit(resource.RLIMIT_AS, self._memory)
         self._warnings.__exit__(None, None, None)
-        np.seterr(**self._numbers)
         signal.signal(signal.SIGPROF, self._handler)
 
 

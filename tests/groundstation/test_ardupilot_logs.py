@@ -1,6 +1,7 @@
 """ArduPilot's dataflash logs: what was flown comes out as flown, whatever was logged; damage is told in one line."""
 
 import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -112,6 +113,30 @@ def test_a_draft_that_cannot_be_names_its_log(tmp_path):
     with pytest.raises(InputError, match=r"fast\.bin: .*hover_thrust") as error:
         draft_of(log.save(tmp_path / "fast.bin"), tmp_path / "vehicle.toml")
     assert "\n" not in str(error.value)
+
+
+def test_numbers_that_damage_makes_bring_no_warning(tmp_path, recwarn):
+    """Signalling NaN, infinity and what no sensor reads, anywhere in the log; times that go back and repeat."""
+    one = flown()
+    force = one.specific_force.copy()
+    rows = np.arange(900, 1500, 60)
+    force[rows, 2] = 7.0 + 0.001 * np.arange(len(rows))
+    raw = copter(replace(one, specific_force=force)).bytes()
+    worst = [struct.pack("<I", bits) for bits in (0x7FA00000, 0x7FC00000, 0x7F800000, 0xFF7FFFFF, 0xFFA00001)]
+    for k, value in enumerate(force[rows, 2]):
+        before = struct.pack("<f", -value)
+        assert before in raw
+        raw = raw.replace(before, worst[k % len(worst)])
+    times = [struct.pack("<Q", round(1e6 * one.t[row])) for row in (1000, 1001, 1002, 1203)]
+    raw = (
+        raw.replace(times[1], times[0])
+        .replace(times[2], times[3])
+        .replace(times[3], struct.pack("<Q", 2**64 - 1))
+    )
+    path = tmp_path / "damaged.bin"
+    path.write_bytes(raw)
+    assert read_flight(path, QUAD5).flying.sum() > 1000
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
 
 
 def test_the_core_that_flew_is_read_and_nothing_across_a_change_of_it(tmp_path):
