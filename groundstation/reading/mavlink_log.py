@@ -39,6 +39,8 @@ ADVICE = (
     "raise the telemetry's rates (SRn_EXTRA1, SRn_POSITION, SRn_RC_CHAN, SRn_RAW_SENS to 10 Hz or more), or take the "
     "log of the vehicle itself (.bin, .ulg)"
 )
+FINER, OFTENER = ("actuator_motors", "actuator_outputs", "vehicle_rates_setpoint"), 1.5
+"""What tells the thrust finer than whole percents, and how many times as often those must come to be read instead."""
 NAMES = {
     "vehicle_attitude": "ATTITUDE",
     "vehicle_local_position": "LOCAL_POSITION_NED",
@@ -191,10 +193,13 @@ def _log(path: Path, kinds: dict[str, Received], notes: list[str]) -> Log:
             i: servos.column(f"servo{i + 1}_raw") for i in range(16) if f"servo{i + 1}_raw" in servos.rows[0]
         }
         parts += of_pulses(_stamp(servos, clock, shift), outputs, parameters, frame.count)
-    finer = {"actuator_motors", "actuator_outputs", "vehicle_rates_setpoint"} & {name for name, _, _ in parts}
+    finer = [len(fields["timestamp"]) for name, _, fields in parts if name in FINER]
     parts = [
-        part for part in parts if not finer or part[0] != "vehicle_attitude_setpoint"
-    ]  # in whole percents
+        part
+        for part in parts
+        if part[0] != "vehicle_attitude_setpoint"
+        or len(part[2]["timestamp"]) > OFTENER * max(finer, default=0)
+    ]
     told = {name for name, instance, _ in parts if instance == 0}
     parts = [part for part in parts if part[1] == 0 or part[0] not in told]
     version = _version(kinds)

@@ -27,7 +27,12 @@ from trueflight.groundstation.reading.px4_airborne import (
 from trueflight.groundstation.reading.px4_log import Log, Topic
 from trueflight.groundstation.reading.px4_motion import attitude_of, motion_of
 from trueflight.groundstation.reading.px4_resets import without_resets
-from trueflight.groundstation.reading.px4_thrust import commanded_thrust, motor_commands, rotor_speeds
+from trueflight.groundstation.reading.px4_thrust import (
+    commanded_thrust,
+    motor_commands,
+    rotor_speeds,
+    too_slow,
+)
 from trueflight.groundstation.reading.sources import COLLECTIVE
 from trueflight.models.errors import InputError
 from trueflight.models.flight import Flight
@@ -206,9 +211,9 @@ def _commands(log: Log, air: Airborne, vehicle: Vehicle) -> tuple[dict[str, np.n
     count = motor_count(log)
     thrust = commanded_thrust(log.of("thrust_command"), first, last, count)
     if thrust is None:
-        raise InputError(
-            f"{log.origin}: no thrust command in the log ({', '.join(_tellers(log))}); {log.advice}"
-        )
+        none = f"no thrust command in the log ({', '.join(_tellers(log))})"
+        said = too_slow(log.of("thrust_command"), first, last, count)
+        raise InputError(f"{log.origin}: {said or none}; {log.advice}")
     values = np.where(armed, np.nan_to_num(_interpolated(thrust.t, thrust.values, clock)), 0.0)
     notes = [f"thrust is {thrust.said}, logged at {thrust.rate:.0f} Hz"]
     if thrust.rate < 0.9 * RATE:

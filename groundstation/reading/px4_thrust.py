@@ -18,7 +18,7 @@ from trueflight.groundstation.reading.px4_log import Log, Topic
 ENOUGH = 40.0
 """Hz; the first source that is this fast is taken, otherwise the fastest: PX4's default profile logs setpoints at 50
 Hz and motors at 10."""
-SLOWEST = 4.0
+SLOWEST = 3.5
 """Hz; below it a command tells nothing of a flight."""
 SLOWEST_MOTORS = 20.0  # Hz; below it motor commands alias
 MOTOR_1 = 101  # PX4's output function "Motor 1"
@@ -61,6 +61,14 @@ def commanded_thrust(log: Log, first: float, last: float, motors: int) -> Thrust
         if source.rate >= SLOWEST and (best is None or source.rate > 1.5 * best.rate):
             best = source
     return best
+
+
+def too_slow(log: Log, first: float, last: float, motors: int) -> str:
+    """What to say where thrust is told, and too seldom for a flight to be compared with it; '' otherwise."""
+    fastest = max(_sources(log, first, last, motors), key=lambda source: source.rate, default=None)
+    if fastest is None:
+        return ""
+    return f"thrust is {fastest.said} and was logged at {fastest.rate:.2g} Hz; at least {SLOWEST:.2g} Hz are needed"
 
 
 def motor_commands(log: Log, first: float, last: float, count: int) -> Motors | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import pkgutil
 from functools import cache
 from importlib.metadata import entry_points
@@ -12,6 +13,7 @@ from pathlib import Path
 from trueflight.models.effect import Effect
 from trueflight.models.effects import rigid_body, transport_delay
 from trueflight.models.errors import InputError
+from trueflight.models.outside import shown
 
 EXACT_ROTATION: Effect = rigid_body.EFFECT
 """What every diagnosis starts from: the exact rotation of thrust, instead of the hover linearisation."""
@@ -34,9 +36,9 @@ def catalogue(directory: str | None = None) -> dict[str, Effect]:
         _add(found, entry.load(), f"entry point {entry.name}")
     if directory is not None:
         folder = Path(directory)
-        if not folder.is_dir():
+        if not os.path.isdir(directory):  # Path.is_dir raises for a name that no folder can have
             raise InputError(
-                f"{directory}: no such folder of effects; pass --effects DIR with *.py files in it"
+                f"{shown(directory)}: no such folder of effects; pass --effects DIR with *.py files in it"
             )
         files = sorted(folder.glob("*.py"))
         if not files:

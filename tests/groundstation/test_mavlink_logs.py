@@ -150,3 +150,30 @@ def test_a_vehicle_is_drafted_from_the_parameters_that_were_sent(tmp_path):
     assert (
         draft.vehicle.hover_thrust == pytest.approx(0.38, rel=0.05) and "MOT_THST_HOVER is 0.36" in draft.text
     )
+
+
+def seldom(one, kind: int, every: int) -> list[tuple[float, bytes]]:
+    """The telemetry of a flight with one message of a kind in `every` only."""
+    out, count = [], 0
+    for t, message in telemetry(one, rate=20):
+        if message[7] == kind:
+            count += 1
+            if count % every:
+                continue
+        out.append((t, message))
+    return out
+
+
+def test_thrust_that_is_told_too_seldom_is_said_to_be(tmp_path):
+    """Pulses at 2 Hz: whole percents that come oftener are read instead; where those are missing, too, it is told."""
+    one, pulses_, percents = flown(), mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, mavlink.MAVLINK_MSG_ID_VFR_HUD
+    flight = read_flight(save(tmp_path / "percents.tlog", seldom(one, pulses_, 10)), QUAD5)
+    assert any("VFR_HUD" in note for note in flight.notes)
+    rows, there = middle_of(flight, one)
+    np.testing.assert_allclose(flight.thrust_command[rows], one.thrust[there], atol=0.02)
+    left = [m for m in seldom(one, pulses_, 10) if m[1][7] != percents]
+    with pytest.raises(
+        InputError, match=r"SERVO_OUTPUT_RAW and was logged at 2 Hz; at least 3.5 Hz"
+    ) as error:
+        read_flight(save(tmp_path / "seldom.tlog", left), QUAD5)
+    assert "\n" not in str(error.value)
