@@ -110,7 +110,7 @@ def flight_of(path: Path, log: Log, vehicle: Vehicle, mapping: Mapping | None = 
         notes=tuple(notes),
         most_lost=1.0,  # what was not recorded is told, and what is left is whole
         mapping=mapping,
-        rates={} if slow is None else {"specific_force": slow},
+        rates=_rates_of(log, air, columns, slow),
     )
 
 
@@ -188,6 +188,20 @@ def _inertial(log: Log, air: Airborne) -> tuple[dict[str, np.ndarray], list[Topi
 def _tellers(log: Log) -> list[str]:
     """What could tell the thrust, as the log would call it."""
     return list(dict.fromkeys(log.name_of(topic) for topic in COLLECTIVE))
+
+
+def _rates_of(
+    log: Log, air: Airborne, columns: dict[str, np.ndarray], slow: float | None
+) -> dict[str, float]:
+    """The true rates (Hz) of what was interpolated and is compared with the thrust: the accelerometer's, or, without
+    one, the velocity's."""
+    if slow is not None:
+        return {"specific_force": slow}
+    estimate = log.of("velocity").topic("vehicle_local_position")
+    if "specific_force" in columns or "velocity" not in columns or estimate is None:
+        return {}
+    rate = estimate.rate_within(*air.span)
+    return {"velocity": rate} if rate < FAST else {}
 
 
 def _least(log: Log) -> float:

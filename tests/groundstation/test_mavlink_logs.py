@@ -8,6 +8,7 @@ from dataflash_writer import PARAMETERS, pulses
 from px4_layouts import flown, frd, middle_of, motors, ned
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from trueflight.groundstation.measured.measurement import measure
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.versions.vehicle_draft import draft_of
 from trueflight.models.errors import InputError
@@ -177,3 +178,12 @@ def test_thrust_that_is_told_too_seldom_is_said_to_be(tmp_path):
     ) as error:
         read_flight(save(tmp_path / "seldom.tlog", left), QUAD5)
     assert "\n" not in str(error.value)
+
+
+def test_an_estimate_that_comes_four_times_a_second_tells_nothing_faster_and_has_noise(tmp_path):
+    """Between its samples the log holds straight lines, which have none."""
+    sent = [m for m in telemetry(flown(), rate=4) if m[1][7] != mavlink.MAVLINK_MSG_ID_RAW_IMU]
+    flight = read_flight(save(tmp_path / "radio.tlog", sent), QUAD5)
+    assert flight.sensor_rate == pytest.approx(4.0, rel=0.1) and not flight.has("specific_force")
+    measured = measure(flight)
+    assert measured.bandwidth < 2.0 and measured.noise.min() > 1e-4
