@@ -18,6 +18,7 @@ ALLOWED = {
         "trueflight.groundstation", "torch", "control", "scipy", "rerun", "pyarrow", "pyulog", "pymavlink", "rosbags",
         "onnx", "onnxruntime", "mcap", "mcap_ros2", "zstandard", "google", "zenoh", "jinja2", "markupsafe",
         "matplotlib", "pandas", "dask", "distributed", "cryptography", "threadpoolctl", "sympy", "starlette", "uvicorn",
+        "foxglove",
     },
     "sim_bridge": {
         "trueflight.sim_bridge", "trueflight.companion", "mujoco", "pymavlink", "scipy", "mcap", "google",

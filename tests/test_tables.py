@@ -43,6 +43,7 @@ NO_TABLE = {
     "groundstation effect new": "the file it wrote",
     "groundstation monitor": "how many ticks it saw",
     "groundstation ros2-bridge": "what it publishes",
+    "groundstation foxglove": "what it serves, and where",
     "groundstation deploy": "accepted, or why not",
     "companion run": "that it is ready",
     "companion doctor": "as preflight",

@@ -1,7 +1,8 @@
-"""`groundstation status` and `ros2-bridge`: what a companion is doing, for a person and for ROS 2."""
+"""`groundstation status`, `ros2-bridge`, `foxglove`: what a companion is doing, for a person, ROS 2 and viewers."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -32,6 +33,11 @@ def register(app: typer.Typer) -> None:
         epilog="Example: groundstation ros2-bridge -e tcp/192.168.1.7:7447; then, with "
         "RMW_IMPLEMENTATION=rmw_zenoh_cpp: ros2 topic list, rviz2, PlotJuggler, foxglove_bridge",
     )(linked(ros2_command))
+    app.command(
+        "foxglove",
+        epilog="Example: groundstation foxglove -e tcp/192.168.1.7:7447 --layout quad5.json; then, in Foxglove, "
+        "Lichtblick or PlotJuggler, open ws://127.0.0.1:8765",
+    )(linked(foxglove_command))
 
 
 def _position(position: dict[str, Any]) -> str:
@@ -145,11 +151,10 @@ def ros2_command(
 ) -> None:
     """Publish a vehicle to ROS 2 (rmw_zenoh): odometry, reference, command, IMU, battery, diagnostics. Needs no ROS."""
     from trueflight.groundstation.operate.link import Link
-    from trueflight.groundstation.operate.ros2 import DISTRIBUTIONS, Messages, RosNode, topics_of
+    from trueflight.groundstation.operate.ros2 import Messages, RosNode, topics_of
     from trueflight.groundstation.operate.ros2_bridge import Bridge, open_ros
 
-    if distribution not in DISTRIBUTIONS:
-        raise InputError(f"--ros {distribution}: it must be one of {', '.join(DISTRIBUTIONS)}")
+    _check_release(distribution)
     with open_ros(router) as session, Link(settings) as link:
         print_warning(link.warning)
         messages = Messages(link.vehicle, distribution)
@@ -159,3 +164,58 @@ def ros2_command(
         seen = Bridge(node, messages).run(link, seconds)
         console.print(f"{seen} ticks seen, {node.sent} messages published", highlight=False)
         node.close()
+
+
+def foxglove_command(
+    port: Annotated[
+        int, typer.Option("--port", help="Where to serve; 0: any that is free.", min=0, max=65535)
+    ] = 8765,
+    host: Annotated[
+        str,
+        typer.Option(
+            "--host", help="Address to serve at; others than this machine's own show it to the network."
+        ),
+    ] = "127.0.0.1",
+    layout: Annotated[
+        Path | None,
+        typer.Option(
+            "--layout", help="Also write a layout for Foxglove and Lichtblick into this file (.json)."
+        ),
+    ] = None,
+    distribution: Annotated[
+        str, typer.Option("--ros", help="Release of ROS 2 whose messages are sent: humble, jazzy, kilted.")
+    ] = "jazzy",
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", help="Stop after this long; default: until Ctrl-C.", min=0.1)
+    ] = None,
+    *,
+    settings: Settings,
+) -> None:
+    """Serve what ros2-bridge publishes to Foxglove, Lichtblick and PlotJuggler themselves, without any ROS."""
+    import json
+
+    from trueflight.groundstation.operate import foxglove
+    from trueflight.groundstation.operate.link import Link
+    from trueflight.groundstation.operate.ros2 import Messages, topics_of
+    from trueflight.groundstation.operate.ros2_bridge import Bridge
+    from trueflight.models.whole_file import write_whole
+
+    _check_release(distribution)
+    with Link(settings) as link:
+        print_warning(link.warning)
+        messages = Messages(link.vehicle, distribution)
+        with foxglove.FoxgloveServer(link.vehicle, messages, host, port) as server:
+            if layout is not None:
+                text = json.dumps(foxglove.layout(link.vehicle), indent=1)
+                write_whole(layout, text, "the layout", "choose another --layout")
+            names = ", ".join(topic.name for topic in topics_of(link.vehicle).values())
+            console.print(f"ws://{host}:{server.port} serves {names}; Ctrl-C ends", highlight=False)
+            seen = Bridge(server, messages).run(link, seconds)
+            console.print(f"{seen} ticks seen, {server.sent} messages served", highlight=False)
+
+
+def _check_release(distribution: str) -> None:
+    from trueflight.groundstation.operate.ros2 import DISTRIBUTIONS
+
+    if distribution not in DISTRIBUTIONS:
+        raise InputError(f"--ros {distribution}: it must be one of {', '.join(DISTRIBUTIONS)}")

@@ -142,6 +142,10 @@ TASKS: dict[str, dict[str, Entry]] = {
             "Publish a vehicle to ROS 2 (rmw_zenoh): odometry, reference, command, IMU, battery, diagnostics. "
             "Needs no ROS.",
         ),
+        "foxglove": Entry(
+            "status",
+            "Serve what ros2-bridge publishes to Foxglove, Lichtblick and PlotJuggler themselves, without any ROS.",
+        ),
         "keys": Entry(
             "keys",
             "Make a certificate authority and keys for vehicles and people, or add some to those that are there.",

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import struct
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import zenoh
@@ -41,10 +42,13 @@ def topics_of(vehicle: str) -> dict[str, RosTopic]:
     """What is published of a vehicle, by what it tells."""
     space = f"/{ros_name(vehicle)}"
     return {
+        "tf": RosTopic("/tf", "tf2_msgs/msg/TFMessage"),
         "odometry": RosTopic(f"{space}/odometry", "nav_msgs/msg/Odometry"),
         "reference": RosTopic(f"{space}/reference", "geometry_msgs/msg/PoseStamped"),
         "command": RosTopic(f"{space}/command", "geometry_msgs/msg/TwistStamped"),
         "imu": RosTopic(f"{space}/imu", "sensor_msgs/msg/Imu"),
+        "path": RosTopic(f"{space}/path", "nav_msgs/msg/Path"),
+        "reference_path": RosTopic(f"{space}/reference_path", "nav_msgs/msg/Path"),
         "battery": RosTopic(f"{space}/battery", "sensor_msgs/msg/BatteryState"),
         "diagnostics": RosTopic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
     }
@@ -54,6 +58,36 @@ def ros_name(vehicle: str) -> str:
     """The vehicle's name as ROS allows it: letters, digits and underscores, a letter first."""
     name = "".join(c if c.isascii() and c.isalnum() else "_" for c in vehicle)
     return name if name[:1].isalpha() else f"v{name}"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where something was: `stamp` in s since 1970, `position` in m (ENU), `quaternion` w, x, y, z body to world."""
+
+    stamp: float
+    position: Vector3
+    quaternion: np.ndarray
+
+
+class Trail:
+    """The places of the last `LASTING` seconds, one every `APART` seconds, oldest first."""
+
+    LASTING, APART = 30.0, 0.1
+
+    def __init__(self) -> None:
+        self.places: deque[Place] = deque()
+
+    def add(self, place: Place) -> None:
+        """Take one more place; one before the last begins anew, for then the clock did."""
+        if self.places and place.stamp < self.places[-1].stamp:
+            self.places.clear()
+        if not self.places or place.stamp - self.places[-1].stamp >= self.APART:
+            self.places.append(place)
+
+    def forget(self, now: float) -> None:
+        """Let go what is too old at `now`, s since 1970."""
+        while self.places and now - self.places[0].stamp > self.LASTING:
+            self.places.popleft()
 
 
 class Messages:
@@ -71,9 +105,14 @@ class Messages:
         """The hash of a type as it stands in keys and tokens (REP 2016)."""
         return str(self._store.hash_rihs01(kind)) if self._hashed else "TypeHashNotSupported"
 
+    def definition(self, kind: str) -> str:
+        """A type's definition with those that it is made of, as ROS' `.msg` files have it, for readers without ROS."""
+        text: str = self._store.generate_msgdef(kind, ros_version=2)[0]
+        return text
+
     def of_tick(self, tick: Tick, stamp: float) -> Iterator[tuple[str, bytes]]:
         """What a tick tells, each with its key of `topics_of` and its bytes; `stamp` is its time, s since 1970."""
-        q = np.array([tick.quaternion.w, tick.quaternion.x, tick.quaternion.y, tick.quaternion.z])
+        q = turn(tick)
         pose = self._made(
             "geometry_msgs/msg/Pose", position=self._point(tick.position), orientation=self._turn(q)
         )
@@ -82,6 +121,16 @@ class Messages:
             linear=self._vector(rotate_inverse(q, _array(tick.velocity)) if np.any(q) else np.zeros(3)),
             angular=self._vector(_array(tick.angular_velocity)),
         )
+        if np.any(q):
+            place = self._made(
+                "geometry_msgs/msg/Transform",
+                translation=self._vector(_array(tick.position)),
+                rotation=self._turn(q),
+            )
+            yield self._packed("tf", "tf2_msgs/msg/TFMessage", transforms=[self._made(
+                "geometry_msgs/msg/TransformStamped", header=self._header(stamp, MAP), child_frame_id=self._body,
+                transform=place,
+            )])  # fmt: skip
         unknown = np.zeros(36)
         yield self._packed(
             "odometry", "nav_msgs/msg/Odometry", header=self._header(stamp, MAP), child_frame_id=self._body,
@@ -89,12 +138,8 @@ class Messages:
             twist=self._made("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown),
         )  # fmt: skip
         if tick.HasField("position_reference"):
-            yaw = quaternion_from_euler(np.array([0.0, 0.0, tick.yaw_reference]))
-            yield self._packed(
-                "reference", "geometry_msgs/msg/PoseStamped", header=self._header(stamp, MAP),
-                pose=self._made("geometry_msgs/msg/Pose", position=self._point(tick.position_reference),
-                                orientation=self._turn(yaw)),
-            )  # fmt: skip
+            place = Place(stamp, tick.position_reference, reference_turn(tick))
+            yield "reference", self._cdr(self._pose(place), "geometry_msgs/msg/PoseStamped")
         if tick.setpoint_sent:
             sent = self._made(
                 "geometry_msgs/msg/Twist",
@@ -115,6 +160,11 @@ class Messages:
                 angular_velocity_covariance=known, linear_acceleration=self._vector(_array(tick.specific_force)),
                 linear_acceleration_covariance=known,
             )  # fmt: skip
+
+    def path(self, topic: str, trail: Trail, stamp: float) -> tuple[str, bytes]:
+        """A trail, as the path of that key of `topics_of`."""
+        poses = [self._pose(place) for place in trail.places]
+        return self._packed(topic, "nav_msgs/msg/Path", header=self._header(stamp, MAP), poses=poses)
 
     def battery(self, tick: Tick, stamp: float) -> tuple[str, bytes]:
         """The battery's voltage; what is not known is NaN, as the message's definition asks."""
@@ -158,7 +208,18 @@ class Messages:
         )
 
     def _packed(self, topic: str, kind: str, **fields: Any) -> tuple[str, bytes]:
-        return topic, bytes(self._store.serialize_cdr(self._made(kind, **fields), kind))
+        return topic, self._cdr(self._made(kind, **fields), kind)
+
+    def _cdr(self, message: Any, kind: str) -> bytes:
+        return bytes(self._store.serialize_cdr(message, kind))
+
+    def _pose(self, place: Place) -> Any:
+        pose = self._made(
+            "geometry_msgs/msg/Pose",
+            position=self._point(place.position),
+            orientation=self._turn(place.quaternion),
+        )
+        return self._made("geometry_msgs/msg/PoseStamped", header=self._header(place.stamp, MAP), pose=pose)
 
     def _made(self, kind: str, **fields: Any) -> Any:
         return self._store.types[kind](**fields)
@@ -179,6 +240,27 @@ class Messages:
     def _turn(self, q: np.ndarray) -> Any:
         w, x, y, z = (float(c) for c in q)
         return self._made("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def turn(tick: Tick) -> np.ndarray:
+    """The attitude of a tick, w x y z body to world; zeros where it is unknown."""
+    return np.array([tick.quaternion.w, tick.quaternion.x, tick.quaternion.y, tick.quaternion.z])
+
+
+def reference_turn(tick: Tick) -> np.ndarray:
+    """The reference's yaw as a quaternion w, x, y, z."""
+    return quaternion_from_euler(np.array([0.0, 0.0, tick.yaw_reference]))
+
+
+class Publisher(Protocol):
+    """Where messages go: a node of ROS, or a server that viewers ask."""
+
+    @property
+    def sent(self) -> int:
+        """Messages sent so far."""
+
+    def publish(self, topic: str, data: bytes, stamp: float) -> None:
+        """Send one message of a key of `topics_of`; `stamp` is now, s since 1970."""
 
 
 def _array(v: Vector3) -> np.ndarray:

@@ -1,23 +1,24 @@
-"""From a companion's ticks and events to a ROS 2 node, until told to end."""
+"""From a companion's ticks and events to ROS 2 or to viewers, until told to end."""
 
 from __future__ import annotations
 
 import json
 import queue
 import time
+from collections.abc import Iterator
 
 import zenoh
 
 from trueflight.groundstation.operate.link import Link
 from trueflight.groundstation.operate.processes import told_to_end
-from trueflight.groundstation.operate.ros2 import Messages, RosNode
+from trueflight.groundstation.operate.ros2 import Messages, Place, Publisher, Trail, reference_turn, turn
 from trueflight.models.errors import InputError
 from trueflight.models.record_pb2 import Event, Tick
 
 ROUTER = "tcp/localhost:7447"
 """Where `ros2 run rmw_zenoh_cpp rmw_zenohd` listens."""
 PERIOD = 0.01  # s between two looks at what has arrived
-STATE = 0.5  # s of the vehicle between two diagnostics of the flight, and two of the battery
+STATE = 0.5  # s of the vehicle between two diagnostics of the flight, and two of the battery and of each path
 
 
 def open_ros(router: str) -> zenoh.Session:
@@ -38,13 +39,14 @@ def open_ros(router: str) -> zenoh.Session:
 
 
 class Bridge:
-    """Turns ticks and events into messages of a node, as they come."""
+    """Turns ticks and events into messages and publishes them, as they come."""
 
-    def __init__(self, node: RosNode, messages: Messages) -> None:
+    def __init__(self, node: Publisher, messages: Messages) -> None:
         self.ticks: queue.SimpleQueue[Tick] = queue.SimpleQueue()
         self.events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self.seen = 0
         self._node, self._messages = node, messages
+        self._flown, self._asked = Trail(), Trail()
         self._behind: float | None = None
         self._state = -STATE
 
@@ -67,14 +69,24 @@ class Bridge:
             stamp = self._stamp(flown, now)
             for topic, data in self._messages.of_tick(tick, stamp):
                 self._node.publish(topic, data, now)
+            self._flown.add(Place(stamp, tick.position, turn(tick)))
+            if tick.HasField("position_reference"):
+                self._asked.add(Place(stamp, tick.position_reference, reference_turn(tick)))
             if abs(flown - self._state) >= STATE:
                 self._state = flown
-                for topic, data in (self._messages.state(tick, stamp), self._messages.battery(tick, stamp)):
+                for topic, data in self._now_and_then(tick, stamp):
                     self._node.publish(topic, data, now)
         for _ in range(self.events.qsize()):
             now = time.time()
             topic, data = self._messages.of_event(self.events.get(), now)
             self._node.publish(topic, data, now)
+
+    def _now_and_then(self, tick: Tick, stamp: float) -> Iterator[tuple[str, bytes]]:
+        yield self._messages.state(tick, stamp)
+        yield self._messages.battery(tick, stamp)
+        for topic, trail in (("path", self._flown), ("reference_path", self._asked)):
+            trail.forget(stamp)
+            yield self._messages.path(topic, trail, stamp)
 
     def _stamp(self, flown: float, now: float) -> float:
         """The time of a tick, s since 1970: the vehicle's clock, by the message that came with the least delay. A clock

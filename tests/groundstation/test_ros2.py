@@ -6,11 +6,13 @@ import math
 import queue
 import socket
 import struct
+import sys
 import time
 
 import numpy as np
 import programs
 import pytest
+import websockets.sync.client
 import zenoh
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
@@ -18,11 +20,14 @@ from rosbags.typesys import Stores, get_typestore
 
 from trueflight.companion.telemetry import Telemetry, make_event
 from trueflight.companion.zenoh_session import ZenohSettings, open_session
+from trueflight.groundstation.operate.foxglove import FoxgloveServer, layout
 from trueflight.groundstation.operate.link import Link
 from trueflight.groundstation.operate.ros2 import (
     Messages,
+    Place,
     RosNode,
     RosTopic,
+    Trail,
     attachment,
     publisher_token,
     ros_name,
@@ -44,7 +49,12 @@ STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a1
 def decoded(kind: str, data: bytes):
     """A message as mcap-ros2-support reads it, by the definition that ROS distributes."""
     definition = get_typestore(Stores.ROS2_JAZZY).generate_msgdef(kind, ros_version=2)[0]
-    decode = DecoderFactory().decoder_for("cdr", Schema(1, definition.encode(), "ros2msg", kind))
+    return read(kind, definition.encode(), data)
+
+
+def read(kind: str, definition: bytes, data: bytes):
+    """A message by a definition in ROS' own words."""
+    decode = DecoderFactory().decoder_for("cdr", Schema(1, definition, "ros2msg", kind))
     return decode(data)
 
 
@@ -163,8 +173,74 @@ def test_a_subscriber_of_ros_gets_what_the_companion_tells(router, tmp_path):
     finally:
         telemetry.close()
     put = [t for t in tokens if "PUT" in t]
-    assert sum("/MP/" in t for t in put) == 6 and sum("/NN/" in t for t in put) == 1
+    assert sum("/MP/" in t for t in put) == len(topics_of("quad5")) and sum("/NN/" in t for t in put) == 1
     assert all("trueflight_quad5" in t for t in put)
+
+
+def test_a_viewer_without_ros_reads_every_topic_by_the_definition_that_is_served():
+    """A client of Foxglove's WebSocket protocol, spoken here; what it gets is read by another library."""
+    messages, got = Messages("my-quad"), {}
+    with FoxgloveServer("my-quad", messages, port=0) as server:
+        bridge = Bridge(server, messages)
+        with websockets.sync.client.connect(
+            f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"]
+        ) as viewer:
+            channels = {}
+            while len(channels) < len(topics_of("my-quad")):
+                told = json.loads(viewer.recv(PATIENCE))
+                channels |= {one["id"]: one for one in told.get("channels", ())}
+            asked = [{"id": number, "channelId": number} for number in channels]
+            viewer.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+            until, row = time.monotonic() + PATIENCE, 0
+            while time.monotonic() < until and len(got) < len(channels):
+                row += 1
+                bridge.ticks.put(tick(1.0 + 0.1 * row))
+                bridge.forward()
+                try:
+                    frame = viewer.recv(0.05)
+                except TimeoutError:
+                    continue
+                if isinstance(frame, bytes) and frame[0] == 1:
+                    channel = channels[struct.unpack_from("<I", frame, 1)[0]]
+                    assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
+                    got[channel["topic"]] = read(
+                        channel["schemaName"], channel["schema"].encode(), frame[13:]
+                    )
+        with pytest.raises(InputError, match=f"127.0.0.1:{server.port}.*--port"):
+            FoxgloveServer("my-quad", messages, port=server.port)
+    assert set(got) == {topic.name for topic in topics_of("my-quad").values()}
+    transform = got["/tf"].transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == ("map", "my_quad/base_link")
+    assert (transform.transform.translation.x, transform.transform.translation.z) == (1.0, 3.0)
+    assert got["/my_quad/odometry"].pose.pose.position.y == -2.0
+    assert got["/my_quad/path"].poses[0].pose.position.z == 3.0
+    assert got["/my_quad/reference_path"].poses[0].pose.position.z == 3.5
+
+
+def test_the_layout_shows_topics_that_are_served():
+    served = {topic.name for topic in topics_of("my-quad").values()}
+    panels = layout("my-quad")["configById"]
+    shown = set(panels["3D!scene"]["topics"])
+    shown |= {path["value"].split(".")[0] for name in panels for path in panels[name].get("paths", ())}
+    assert shown and shown <= served
+
+
+def test_without_foxglove_sdk_what_to_install_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(InputError, match=r"pip install 'trueflight\[foxglove\]'"):
+        FoxgloveServer("quad5", Messages("quad5"), port=0)
+
+
+def test_a_path_is_the_last_half_minute_and_begins_anew_with_the_clock():
+    trail = Trail()
+    for row in range(64 * 40):
+        trail.add(Place(100.0 + row / 64, tick().position, np.array([1.0, 0.0, 0.0, 0.0])))
+    trail.forget(140.0)
+    stamps = [place.stamp for place in trail.places]
+    assert 110.0 <= stamps[0] < 110.2 and stamps[-1] > 139.8
+    assert all(Trail.APART <= gap < Trail.APART + 2 / 64 for gap in np.diff(stamps))
+    trail.add(Place(5.0, tick().position, np.array([1.0, 0.0, 0.0, 0.0])))
+    assert [place.stamp for place in trail.places] == [5.0]
 
 
 def test_no_router_is_told_with_how_to_start_it():
