@@ -104,7 +104,7 @@ class Shadow:
         trajectory since the last step, 0 where the flight is elsewhere (takeoff, landing).
         """
         dt = min(self.limits.smoothing, dt) if dt > 0.0 else 0.0
-        raw, _ = self.watch.evaluate(features, dt)
+        raw, _ = self.watch.evaluate(features, dt, measured)
         if self.watch.tripped:
             self.refused = self.refused or self.watch.reason
             return raw

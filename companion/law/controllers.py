@@ -96,10 +96,12 @@ class Corrector(Protocol):
         measured there (None where it cannot be believed), and why nothing may be learnt now, in words."""
         ...
 
-    def step(self, rows: Sequence[list[float]], ahead: float, dt: float, height: float) -> Correction:
+    def step(
+        self, rows: Sequence[list[float]], ahead: float, dt: float, height: float, measured: Vector | None
+    ) -> Correction:
         """The correction for four rows of features: when tilt acts, `ahead` s later, when thrust acts, and now.
 
-        `height` above the ground, m, is the measured one.
+        `height` above the ground, m, is the measured one, `measured` the error acceleration as for `learn`.
         """
         ...
 
@@ -292,9 +294,10 @@ class Corrected:
             (state, Attitude(zeta[0], zeta[1], acting)),
         )
         rows = [features(then, yaw, attitude, voltage, corrector.wants_yaw) for then, attitude in moments]
+        measured = self._observer.beyond_linear(zeta)
         if corrector.learning is not None:
-            corrector.learn(rows[3], self._observer.beyond_linear(zeta), dt, self._why_not_learn())
-        correction = corrector.step(rows, ahead, dt, state.height)
+            corrector.learn(rows[3], measured, dt, self._why_not_learn())
+        correction = corrector.step(rows, ahead, dt, state.height, measured)
         (u, v, w), (pushing_x, pushing_y) = self._observer.step(zeta, correction.now, dt)
         trim = (trim[0] + share * u, trim[1] + share * v, trim[2] + share * w)
         x, y, z = correction.applied

@@ -167,10 +167,16 @@ class Guard:
         return Actuation(*(_mean(weights, numbers) for numbers in columns))
 
     def step(
-        self, rows: Sequence[Sequence[float]], ahead: float, dt: float, height: float = math.inf
+        self,
+        rows: Sequence[Sequence[float]],
+        ahead: float,
+        dt: float,
+        height: float = math.inf,
+        measured: Vector | None = None,
     ) -> Correction:
         """The correction for four rows of features: where tilt acts, `ahead` s later, where thrust acts, and now; `dt`
-        s since the last step, `height` in m as measured above the ground.
+        s since the last step, `height` in m as measured above the ground, `measured` the error acceleration that the
+        accelerometer shows now (m/s², heading frame), None where it cannot be believed.
 
         The applied one is finite, within `authority`, and within `slew * dt` of the previous one, always; its rate
         within `slew`.
@@ -184,7 +190,7 @@ class Guard:
         for watch, weight in list(self._weights.items()):
             if weight == 0.0 and not (self._running and watch is self._live):
                 continue
-            look = watch.look(rows, ahead, dt)
+            look = watch.look(rows, ahead, dt, measured)
             self.inference_time += watch.inference_time
             if watch is self._live:
                 raw = look.raw

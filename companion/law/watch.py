@@ -3,6 +3,12 @@
 It believes nothing about the model. Whatever that returns (NaN, infinity, huge numbers), however long it
 takes, or if it raises: what comes out is finite and within an authority per axis. Anything that cannot be
 right trips. A trip latches: the model is not called again.
+
+An answer is believed within its authority and its training range on the model's own word; beyond, as far as the
+accelerometer bears it out. Borne out is what is nearer to the acceleration measured than nothing is: fast flight in
+drag may need more than the authority, and then what is cut is right as far as it goes. Of an answer r beyond the
+authority a and a measurement m, |m - r| < |m| gives m the sign of r and |m| > a / 2, so that what acts is nearer than
+nothing as well: |m - a| < |m|. What is not borne out trips.
 """
 
 from __future__ import annotations
@@ -16,6 +22,7 @@ from typing import NamedTuple
 
 from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
 from trueflight.companion.law.adaptation import Learning
+from trueflight.companion.law.outer_loop import mixed
 
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
@@ -39,10 +46,10 @@ class GuardLimits:
     """How far a correction is trusted.
 
     `authority` m/s² and `slew` m/s³ per axis of the heading frame. A raw value beyond `absurd` times the
-    authority trips; one beyond the authority is cut and trips after `patience` s without a pause. Outside the
-    training range the correction is scaled down, to nothing at `margin` times the range's width, and trips
-    after `patience` s beyond. `deadline` s of processor time for the inferences of one tick: `misses` late
-    ones in a row trip, as does a single one of more than `stall` s.
+    authority trips; one beyond the authority is cut, and trips after `patience` s in which the accelerometer
+    does not bear it out. Outside the training range the correction is scaled down, to nothing at `margin` times the
+    range's width or to the share that is borne out, and trips after `patience` s at nothing. `deadline` s of processor
+    time for the inferences of one tick: `misses` late ones in a row trip, as does a single one of more than `stall` s.
     `fade` s from nothing to full effect and back, and from one model to another. Below `ground` m above the ground the
     thrust that models may take away runs down to nothing.
     """
@@ -57,6 +64,53 @@ class GuardLimits:
     stall: float = 0.05
     fade: float = 1.0
     ground: float = 0.5
+
+
+SMOOTHING = 0.2
+"""s, time constant of the low-pass of what is measured and of what a model says before they are compared, as in the
+shadow; for the first two of it nothing is borne out."""
+
+
+class Borne(NamedTuple):
+    """How far the accelerometer bears a model's answer out: of each axis whether at all, and the `share` of the three,
+    0 to 1, of the squares of what is measured that it explains."""
+
+    axes: tuple[bool, bool, bool]
+    share: float
+
+
+_NOTHING = Borne((False, False, False), 0.0)
+
+
+class Evidence:
+    """What the accelerometer says of one model's answers."""
+
+    def __init__(self) -> None:
+        self._seen = 0.0
+        self._measured, self._said = ZERO, ZERO
+
+    def step(self, said: Vector, measured: Vector | None, dt: float) -> Borne:
+        """Whether what is measured is nearer to what the model says than to nothing, both low-passed.
+
+        Error accelerations of this moment in m/s², heading frame; `measured` is None where the accelerometer cannot be
+        believed: then it begins anew. `dt` s since the last step.
+        """
+        if measured is None or not all(map(math.isfinite, measured)):
+            self._seen = 0.0
+            return _NOTHING
+        if self._seen == 0.0:
+            self._measured, self._said = measured, said
+        self._seen += dt
+        share = dt / (SMOOTHING + dt)
+        self._measured = mixed(self._measured, measured, share)
+        self._said = mixed(self._said, said, share)
+        if self._seen < 2.0 * SMOOTHING:
+            return _NOTHING
+        (a, b, c), (x, y, z) = self._measured, self._said
+        u, v, w = a - x, b - y, c - z
+        axes = abs(u) < abs(a), abs(v) < abs(b), abs(w) < abs(c)
+        all_ = a * a + b * b + c * c
+        return Borne(axes, max(0.0, 1.0 - (u * u + v * v + w * w) / all_) if all_ > 0.0 else 0.0)
 
 
 class Look(NamedTuple):
@@ -106,6 +160,7 @@ class Watch:
         self._clock = clock
         self._late = 0
         self._outside = self._saturated = 0.0
+        self._evidence = Evidence()
 
     @property
     def tripped(self) -> bool:
@@ -118,26 +173,36 @@ class Watch:
         if self.learning is not None:
             self.learning.step(row[: len(self._ranges)], measured, dt, waits)
 
-    def evaluate(self, features: Sequence[float], dt: float) -> tuple[Vector, Vector]:
+    def evaluate(
+        self, features: Sequence[float], dt: float, measured: Vector | None = None
+    ) -> tuple[Vector, Vector]:
         """The model's raw answer, and what of it may act: finite and within the authority; m/s², heading frame.
 
         `features` may be longer than the model's: those come first. `dt` s since the last call, finite and not
-        negative. After a trip both are zero and the model is not called.
+        negative; `measured` is the error acceleration there, None where there is none to be believed. After a trip
+        both are zero and the model is not called.
         """
-        return self._judged((features,), dt)[0]
+        return self._judged((features,), dt, measured)[0]
 
-    def look(self, rows: Sequence[Sequence[float]], ahead: float, dt: float) -> Look:
+    def look(
+        self, rows: Sequence[Sequence[float]], ahead: float, dt: float, measured: Vector | None = None
+    ) -> Look:
         """What the model says for four rows of features: where tilt acts, `ahead` s later, where thrust acts, now.
 
         x and y are taken from the first row, z from the third, the rate from the first two. The four count as
-        one inference.
+        one inference. `measured` as in `evaluate`, now.
         """
-        (raw, now), (_, later), (lifting, lifted), (_, present) = self._judged(rows, dt)
+        (raw, now), (_, later), (lifting, lifted), (_, present) = self._judged(rows, dt, measured)
         rate = ((later[0] - now[0]) / ahead, (later[1] - now[1]) / ahead)
         return Look((raw[0], raw[1], lifting[2]), (now[0], now[1], lifted[2]), rate, present)
 
-    def _judged(self, rows: Sequence[Sequence[float]], dt: float) -> list[tuple[Vector, Vector]]:
-        """Raw answer and what of it may act for each row; where anything is wrong with one, nothing of all."""
+    def _judged(
+        self, rows: Sequence[Sequence[float]], dt: float, measured: Vector | None
+    ) -> list[tuple[Vector, Vector]]:
+        """Raw answer and what of it may act for each row; where anything is wrong with one, nothing of all.
+
+        The last row is that of the moment of `measured`.
+        """
         self.inference_time = 0.0
         if self.reason:
             return [(ZERO, ZERO) for _ in rows]
@@ -156,9 +221,10 @@ class Watch:
             if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
                 self.trip("the model returned a number that is not finite")
                 return [(ZERO, ZERO) for _ in rows]
-        trusts = [self._trusted(features) for features in rows]
+        borne = self._evidence.step(raws[-1], measured, dt)
+        trusts = [(max(trust, borne.share), worst) for trust, worst in map(self._trusted, rows)]
         self.trust, worst = min(trusts)
-        self._limit(raws, worst, dt)
+        self._limit(raws, worst, dt, borne)
         if self.reason:
             return [(raw, ZERO) for raw in raws]
         a, b, c = self.limits.authority
@@ -168,17 +234,20 @@ class Watch:
             wanted.append((raw, (trust * _within(x, a), trust * _within(y, b), trust * _within(z, c))))
         return wanted
 
-    def _limit(self, raws: Sequence[Vector], worst: str, dt: float) -> None:
-        """Trip on finite answers that come late, are too large, or come from outside the training range."""
+    def _limit(self, raws: Sequence[Vector], worst: str, dt: float, borne: Borne) -> None:
+        """Trip on finite answers that come late, are too large, or come from outside the training range, where they are
+        not `borne` out."""
         limits = self.limits
         if not self._in_time(self.inference_time):
             self.trip(f"inference took {1e3 * self.inference_time:.1f} ms")
             return
-        a, b, c = limits.authority
-        excess = 0.0
-        for x, y, z in raws:
-            excess = max(excess, abs(x) / a, abs(y) / b, abs(z) / c)
-        self._saturated = self._saturated + dt if excess > 1.0 else 0.0
+        excesses = [
+            max(map(abs, answers)) / most
+            for answers, most in zip(zip(*raws, strict=True), limits.authority, strict=True)
+        ]
+        excess = max(excesses)
+        alone = any(e > 1.0 and not out for e, out in zip(excesses, borne.axes, strict=True))
+        self._saturated = self._saturated + dt if alone else 0.0
         self._outside = self._outside + dt if self.trust == 0.0 else 0.0
         if excess > limits.absurd:
             self.trip(f"a correction {excess:.0f} times its authority")

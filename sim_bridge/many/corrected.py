@@ -100,7 +100,8 @@ class ManyCorrected:
                 _features(here, zeta[:2], heading, acting, voltage, guards.wants_yaw),
             ]
         )
-        applied, slope, raw, now = guards.step(rows, ahead, dt, states.height)
+        measured = self._observers.beyond_linear(zeta, heading), self._observers.trust == 1.0
+        applied, slope, raw, now = guards.step(rows, ahead, dt, states.height, *measured)
         pushed, pushing = self._observers.step(zeta, heading, now, dt)
         trim = trim + share * pushed
         slope = slope + pushing

@@ -14,7 +14,7 @@ import onnxruntime
 from trueflight.companion.law.guard import ACTIVE, FADING_IN, LONGEST_STEP, TRIPPED
 from trueflight.companion.law.inference import Model
 from trueflight.companion.law.model_check import check_model
-from trueflight.companion.law.watch import GuardLimits, margin
+from trueflight.companion.law.watch import SMOOTHING, GuardLimits, margin
 from trueflight.models import contract
 from trueflight.models.errors import InputError
 from trueflight.models.vehicle import Vehicle
@@ -60,6 +60,7 @@ class Guards:
         ]
         self._weight, self._saturated, self._outside = np.zeros(count), np.zeros(count), np.zeros(count)
         self._live = np.ones(count, dtype=bool)
+        self._evidence = _Evidence(count)
         self._reasons = [""] * count
         self.applied = np.zeros((3, count))
         self.inference = np.zeros(count)
@@ -82,13 +83,20 @@ class Guards:
         ]
 
     def step(
-        self, rows: np.ndarray, ahead: np.ndarray, dt: float, height: np.ndarray
+        self,
+        rows: np.ndarray,
+        ahead: np.ndarray,
+        dt: float,
+        height: np.ndarray,
+        measured: np.ndarray,
+        believed: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Corrections applied (3, N), their rates (2, N), what models returned (3, N), and what those that act say of
         now (3, N).
 
         `rows` (4, F, N) are the features when tilt acts, `ahead` (N,) s later, when thrust acts, and now; `height` (N,)
-        is in m above the ground.
+        is in m above the ground, `measured` (3, N) the error accelerations that accelerometers show now, where they are
+        `believed` (N,).
         """
         dt = min(LONGEST_STEP, dt)
         self._weight = np.where(self._live, np.minimum(1.0, self._weight + dt / self.limits.fade), 0.0)
@@ -100,8 +108,9 @@ class Guards:
                 raws[:, :, here] = group.answers(rows[:, :, here])
                 self.inference[where] = (time.thread_time() - begin) / len(here)
         shares = self._shares(rows)
-        trust = shares.min(axis=1)
-        raws = self._judged(raws, shares, trust.min(axis=0), dt)
+        axes, explained = self._evidence.step(raws[3], measured, believed, dt)
+        trust = np.maximum(shares.min(axis=1), explained)
+        raws = self._judged(raws, shares, trust.min(axis=0) == 0.0, axes, dt)
         weight = self._weight
         said = trust[:, None] * np.clip(raws, -self._authority, self._authority)
         wanted = said * weight
@@ -122,14 +131,20 @@ class Guards:
         beyond = np.where(np.isnan(inside), np.inf, np.maximum(beyond, 0.0))
         return np.where(beyond == 0.0, 1.0, np.maximum(1.0 - beyond / self._margin, 0.0))
 
-    def _judged(self, raws: np.ndarray, shares: np.ndarray, trust: np.ndarray, dt: float) -> np.ndarray:
-        """Trip what cannot be right; what models returned, nothing where that is not finite."""
+    def _judged(
+        self, raws: np.ndarray, shares: np.ndarray, outside: np.ndarray, axes: np.ndarray, dt: float
+    ) -> np.ndarray:
+        """Trip what cannot be right; what models returned, nothing where that is not finite.
+
+        `axes` (3, N) are those that the accelerometer bears out.
+        """
         limits, live = self.limits, self._live
         finite = np.isfinite(raws).all(axis=(0, 1))
         raws = np.where(finite, raws, 0.0)
-        excess = (np.abs(raws) / self._authority).max(axis=(0, 1))
-        self._saturated = np.where(excess > 1.0, self._saturated + dt, 0.0)
-        self._outside = np.where(trust == 0.0, self._outside + dt, 0.0)
+        excesses = (np.abs(raws) / self._authority).max(axis=0)
+        excess, alone = excesses.max(axis=0), ((excesses > 1.0) & ~axes).any(axis=0)
+        self._saturated = np.where(alone, self._saturated + dt, 0.0)
+        self._outside = np.where(outside, self._outside + dt, 0.0)
         wild, stuck = excess > limits.absurd, self._saturated > limits.patience
         gone = live & (~finite | wild | stuck | (self._outside > limits.patience))
         for i in np.flatnonzero(gone).tolist():
@@ -147,6 +162,37 @@ class Guards:
             self._live = live & ~gone
             self._weight = np.where(gone, 0.0, self._weight)
         return raws
+
+
+class _Evidence:
+    """What the accelerometers of N vehicles say of their models' answers: `companion.law.watch.Evidence` for one."""
+
+    def __init__(self, count: int) -> None:
+        self._seen = np.zeros(count)
+        self._measured, self._said = np.zeros((3, count)), np.zeros((3, count))
+
+    def step(
+        self, said: np.ndarray, measured: np.ndarray, believed: np.ndarray, dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of each axis (3, N) whether what is measured is nearer to what the model says than to nothing, and what share
+        (N,) of the squares of what is measured it explains."""
+        believed = believed & np.isfinite(measured).all(axis=0)
+        begins = believed & (self._seen == 0.0)
+        self._measured = np.where(begins, measured, self._measured)
+        self._said = np.where(begins, said, self._said)
+        share = dt / (SMOOTHING + dt)
+        self._measured = np.where(
+            believed, self._measured + share * (measured - self._measured), self._measured
+        )
+        self._said = np.where(believed, self._said + share * (said - self._said), self._said)
+        self._seen = np.where(believed, self._seen + dt, 0.0)
+        left, all_ = np.abs(self._measured - self._said), np.abs(self._measured)
+        long = self._seen >= 2.0 * SMOOTHING
+        (a, b, c), (u, v, w) = self._measured, self._measured - self._said
+        squares = a * a + b * b + c * c
+        known = long & (squares > 0.0)
+        share = 1.0 - (u * u + v * v + w * w) / np.where(known, squares, 1.0)
+        return (left < all_) & long, np.where(known, np.maximum(share, 0.0), 0.0)
 
 
 class _Group:

@@ -62,6 +62,17 @@ class Observers:
         self._acting = self._acting + share * (arrived - self._acting)
         return self._acceleration, self._acting
 
+    @property
+    def trust(self) -> np.ndarray:
+        """How far each accelerometer is believed, 0 to 1 (N,)."""
+        return self._measured.trust
+
+    def beyond_linear(self, zeta: np.ndarray, heading: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Error accelerations now (3, N), as far as each accelerometer is believed."""
+        linear = np.array([GRAVITY * zeta[1], -GRAVITY * zeta[0], self._acting / self._mass - GRAVITY])
+        beyond: np.ndarray = to_heading(*heading, self._acceleration) - self._measured.trust * linear
+        return beyond
+
     def commanded(self, thrust: np.ndarray) -> None:
         """Thrusts (N,) in N go out now."""
         self._sent.append(thrust)
@@ -72,8 +83,7 @@ class Observers:
     ) -> tuple[np.ndarray, np.ndarray]:
         """What pushes (3, N), and how fast that changes along x and y (2, N) in m/s³."""
         c, s = heading
-        linear = np.array([GRAVITY * zeta[1], -GRAVITY * zeta[0], self._acting / self._mass - GRAVITY])
-        residual = to_heading(c, s, self._acceleration) - self._measured.trust * (linear + modelled)
+        residual = self.beyond_linear(zeta, heading) - self._measured.trust * modelled
         x, y, z = np.clip(residual, -self._most, self._most)
         share = -np.expm1(-self._rate * min(LONGEST_STEP, max(0.0, dt)))
         self._first = self._first + share * (np.array([c * x - s * y, s * x + c * y, z]) - self._first)

@@ -53,7 +53,9 @@ class Oracle:
         self.delta, self.actuation, self.engaged = delta, actuation, engaged
         self.applied = ZERO
 
-    def step(self, rows: Sequence[list[float]], ahead: float, dt: float, height: float) -> Correction:
+    def step(
+        self, rows: Sequence[list[float]], ahead: float, dt: float, height: float, measured: object = None
+    ) -> Correction:
         now, later, lifted, present = (self.delta(row) for row in rows)
         self.applied = (now[0], now[1], lifted[2])
         return Correction(

@@ -68,6 +68,7 @@ answers = st.one_of(
             st.floats(0.0, 0.05),  # s that the inference takes
             st.floats(allow_nan=True, allow_infinity=True),  # dt
             st.tuples(anything, anything),  # features
+            st.one_of(st.none(), st.tuples(anything, anything, anything)),  # what the accelerometer shows
             st.sampled_from(["", "", "", "start", "stop"]),
         ),
         max_size=60,
@@ -88,11 +89,11 @@ def test_the_applied_correction_never_leaves_its_envelope(ticks) -> None:
     guard = guard_of(model, trips=trips, clock=clock)
     guard.start()
     previous = (0.0, 0.0, 0.0)
-    for answer, seconds, dt, features, order in ticks:
+    for answer, seconds, dt, features, measured, order in ticks:
         script.append((answer, seconds))
         if order:
             getattr(guard, order)()
-        applied, _ = step(guard, features, dt)
+        applied = guard.step([features] * 4, 0.02, dt, measured=measured).applied
         longest = min(0.1, dt) if dt > 0 else 0.0
         for i in range(3):
             assert math.isfinite(applied[i])
@@ -143,6 +144,22 @@ def test_a_correction_is_cut_at_its_authority_and_tripped_when_it_stays_there() 
     run(guard, 0.2)
     assert guard.tripped
     assert "authority" in trips[0]
+
+
+@pytest.mark.parametrize(
+    ("truth", "trips"), [(5.0, False), (3.5, False), (2.9, True), (-6.0, True), (None, True)]
+)
+def test_a_correction_beyond_its_authority_is_cut_and_stays_where_the_accelerometer_bears_it_out(
+    truth: float | None, trips: bool
+) -> None:
+    asked = 2.0 * LIMITS.authority[0]
+    guard = guard_of(constant(asked))
+    guard.start()
+    measured = None if truth is None else (truth, 0.0, 0.0)
+    for _ in range(round(3.0 * LIMITS.patience / DT)):
+        applied = guard.step([INSIDE] * 4, 0.02, DT, measured=measured).applied
+    assert guard.tripped is trips
+    assert applied[0] == (0.0 if trips else LIMITS.authority[0])
 
 
 def test_a_short_excess_is_forgiven() -> None:
@@ -245,6 +262,22 @@ def test_outside_its_training_range_it_is_trusted_less_and_then_not_at_all() -> 
     run(guard, 0.2, (2.0 + 2 * margin, 0.0))
     assert guard.tripped
     assert "z outside its training range" in trips[0]
+
+
+def test_outside_its_training_range_it_acts_as_far_as_the_accelerometer_bears_it_out() -> None:
+    def applied(truth: float) -> tuple[float, bool]:
+        guard = guard_of(constant(1.0))
+        guard.start()
+        for _ in range(300):
+            correction = guard.step([(9.0, 0.0)] * 4, 0.02, DT, measured=(truth, 0.0, 0.0))
+        return correction.applied[0], guard.tripped
+
+    assert applied(1.0) == (1.0, False)
+    assert applied(0.8) == (pytest.approx(1.0 - 0.25**2), False), (
+        "a quarter too much: a sixteenth is not explained"
+    )
+    assert applied(4.0) == (pytest.approx(1.0 - 0.75**2), False)
+    assert applied(0.4) == applied(-1.0) == applied(0.0) == (0.0, True)
 
 
 def test_a_feature_that_is_not_a_number_is_outside_every_range() -> None:

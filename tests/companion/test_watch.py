@@ -6,9 +6,11 @@ import math
 from collections.abc import Callable, Sequence
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from trueflight.companion.law.actuation import ACTS_AT_ONCE, Actuation
-from trueflight.companion.law.watch import ZERO, GuardLimits, Range, Watch
+from trueflight.companion.law.watch import SMOOTHING, ZERO, Borne, Evidence, GuardLimits, Range, Watch
 
 LIMITS = GuardLimits(authority=(2.0, 4.0, 8.0), absurd=4.0, patience=1.0, deadline=0.25, misses=3, stall=1.0)
 Z, VX = Range("z", "m", 0.0, 4.0), Range("vx", "m/s", -2.0, 2.0)  # margins 1 m and 1 m/s
@@ -161,6 +163,128 @@ def test_up_to_its_authority_a_model_may_stay_and_beyond_it_for_the_patience_onl
     absurd = watch_of(asking(5.0))
     absurd.evaluate(INSIDE, 0.0)
     assert absurd.reason == "a correction 5 times its authority"
+
+
+NOTHING = Borne((False, False, False), 0.0)
+
+
+def borne_out(said, measured, seconds: float = 1.0) -> Borne:
+    evidence = Evidence()
+    for _ in range(round(seconds / 0.0625)):
+        borne = evidence.step(said, measured, 0.0625)
+    return borne
+
+
+def test_borne_out_is_what_is_nearer_to_the_measured_than_nothing_is() -> None:
+    assert borne_out((1.0, -2.0, 4.0), (1.0, -2.0, 4.0)) == Borne((True, True, True), 1.0)
+    assert borne_out((1.0, 1.0, 1.0), (0.5, 0.625, -1.0)) == Borne((False, True, False), 0.0)
+    assert borne_out((1.0, 0.0, 1.0), (4.0, 0.0, 3.0)) == Borne(
+        (True, False, True), pytest.approx(1.0 - 13.0 / 25.0)
+    )
+    assert borne_out((1.0, 1.0, 1.0), ZERO) == borne_out(ZERO, ZERO) == NOTHING
+
+
+def test_nothing_is_borne_out_until_it_was_seen_twice_as_long_as_it_is_smoothed() -> None:
+    evidence, right = Evidence(), (1.0, 2.0, 3.0)
+    for _ in range(3):
+        for k in range(1, 6):
+            borne = evidence.step(right, right, 0.5 * SMOOTHING)
+            assert borne == (NOTHING if k < 4 else Borne((True, True, True), 1.0))
+        for unbelieved in (None, (1.0, math.nan, 3.0), (math.inf, 2.0, 3.0)):
+            assert evidence.step(right, unbelieved, 0.5 * SMOOTHING) == NOTHING
+
+
+def test_noise_of_the_accelerometer_bears_nothing_out() -> None:
+    evidence = Evidence()
+    for k in range(200):
+        borne = evidence.step((4.0, 4.0, 4.0), ((6.0, -6.0)[k % 2],) * 3, 0.01)
+        assert borne == NOTHING
+
+
+def test_what_is_seen_follows_what_is_measured_and_what_is_said_within_the_smoothing() -> None:
+    evidence = Evidence()
+    for _ in range(100):
+        evidence.step((4.0, 0.0, 0.0), (4.0, 0.0, 0.0), 0.01)
+    turned = [evidence.step((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0), 0.01).axes[0] for _ in range(20)]
+    # 4 of it, of which 8 (1 - (0.2 / 0.21)^k) are gone: half is left after 6 steps
+    assert turned == [k < 6 for k in range(1, 21)]
+    evidence = Evidence()
+    for _ in range(100):
+        evidence.step((4.0, 0.0, 0.0), (4.0, 0.0, 0.0), 0.01)
+    turned = [evidence.step((-4.0, 0.0, 0.0), (4.0, 0.0, 0.0), 0.01).axes[0] for _ in range(20)]
+    assert turned == [0.5 * 8.0 * (1.0 - (0.2 / 0.21) ** k) < 2.0 for k in range(1, 21)]
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_beyond_its_authority_a_model_may_stay_as_long_as_the_accelerometer_bears_that_axis_out(
+    axis: int,
+) -> None:
+    def along(size: float) -> tuple[float, float, float]:
+        return (size if axis == 0 else 0.0, size if axis == 1 else 0.0, size if axis == 2 else 0.0)
+
+    asked = 1.5 * LIMITS.authority[axis]
+    watch = watch_of(constant(*along(asked)))
+    for _ in range(40):
+        raw, wanted = watch.evaluate(INSIDE, 0.25, along(0.75 * asked))
+        assert (raw, wanted) == (along(asked), along(LIMITS.authority[axis]))
+    for _ in range(4):
+        assert not watch.tripped
+        watch.evaluate(INSIDE, 0.25)
+    watch.evaluate(INSIDE, 0.25)
+    assert watch.reason == "beyond its authority for 1 s"
+
+    other = (axis + 1) % 3
+    everywhere = watch_of(constant(*(1.5 * a for a in LIMITS.authority)))
+    measured = [1.5 * a for a in LIMITS.authority]
+    measured[other] = 0.0
+    for _ in range(6):
+        everywhere.look([INSIDE] * 4, 0.02, 0.25, tuple(measured))
+    assert everywhere.reason == "beyond its authority for 1 s", "one axis of three is not borne out"
+
+
+def test_however_well_it_is_borne_out_an_absurd_answer_trips() -> None:
+    watch = watch_of(constant(8.5, 0.0, 0.0))
+    watch.evaluate(INSIDE, 0.25, (8.5, 0.0, 0.0))
+    assert watch.reason == "a correction 4 times its authority"
+
+
+accelerations = st.floats(-7.0, 7.0)
+
+
+@settings(deadline=None)
+@given(
+    st.tuples(accelerations, accelerations, accelerations),
+    st.tuples(accelerations, accelerations, accelerations),
+)
+def test_what_acts_for_long_beyond_the_authority_or_the_range_is_nearer_to_the_measured_than_nothing(
+    asked, measured
+) -> None:
+    for features in (INSIDE, (9.0, 0.0)):
+        watch = watch_of(constant(*asked))
+        for _ in range(12):
+            _, acts = watch.evaluate(features, 0.125, measured)
+        if watch.tripped:
+            continue
+        for r, a, m, most in zip(asked, acts, measured, LIMITS.authority, strict=True):
+            assert abs(a) <= most
+            if abs(r) > most:
+                assert abs(m - a) < abs(m)
+
+
+def test_where_the_range_does_not_trust_the_accelerometer_may_and_the_last_row_is_the_one_it_speaks_of() -> (
+    None
+):
+    watch = watch_of(lambda features: (features[1], 0.0, 0.0))
+    for _ in range(20):
+        look = watch.look([(9.0, 1.0), (9.0, 1.0), (9.0, 1.0), (9.0, 0.5)], 0.5, 0.1, (0.5, 0.0, 0.0))
+    assert look.wanted == (1.0, 0.0, 0.0)
+    assert look.now == (0.5, 0.0, 0.0)
+    assert watch.trust == 1.0
+    for _ in range(20):
+        look = watch.look([(4.25, 1.0), (4.25, 1.0), (4.25, 1.0), (4.25, 1.0)], 0.5, 0.1, (-1.0, 0.0, 0.0))
+    assert watch.trust == look.wanted[0] == 0.75, (
+        "what it does not bear out is trusted as far as the range goes"
+    )
 
 
 def test_the_patience_begins_anew_after_one_answer_within_the_authority_or_the_range() -> None:

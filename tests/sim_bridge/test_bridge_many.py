@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from onnx_models import constant_model, drag_model, linear_model, nan_model
+from onnx_models import RANGES, constant_model, drag_model, linear_model, nan_model
 
 from trueflight.companion.law.controllers import TrimLimits
 from trueflight.models import contract
@@ -274,6 +274,37 @@ def test_the_corrected_cascade_with_its_guard(vehicle: Vehicle, design: Design) 
     told = [flown.guard for flown in found[:-1]]
     assert told[0] == told[2] == "active", told
     assert [text.startswith("tripped") for text in told[3:]] == [True, True, True], told
+
+
+def test_what_the_accelerometer_bears_out_beyond_authority_and_range(
+    vehicle: Vehicle, design: Design
+) -> None:
+    there, back = (0.0, 0.0, 3.0, 0.0), (7.0, 1.0, 3.0, 0.0)
+    path = Trajectory("fast", (min_jerk(there, back, 2.5), min_jerk(back, there, 2.5)))
+    named = {contract.KEY_ACTUATION: KNOWN}
+    narrow = [
+        {
+            "name": name,
+            "unit": unit,
+            "low": -1.0 if name in ("vx", "vy") else low,
+            "high": 1.0 if name in ("vx", "vy") else high,
+        }
+        for (name, unit), (low, high) in zip(contract.FEATURES.items(), RANGES.values(), strict=False)
+    ]
+    models = [
+        drag_model(0.9, metadata=named),
+        drag_model(0.9, metadata={**named, contract.KEY_FEATURES: narrow}),
+        drag_model(-0.9, metadata=named),
+        drag_model(-0.4, metadata={**named, contract.KEY_FEATURES: narrow}),
+    ]
+    plans = [
+        Plan(vehicle, design, path, choose(["rotor_drag:0.9"], vehicle, i), 40 + i, model=onnx, settle=1.2)
+        for i, onnx in enumerate(models)
+    ]
+    told = [flown.guard for flown in each_is_as_alone(plans, close=1e-7)]
+    assert told[:2] == ["active", "active"], told
+    assert told[2] == "tripped: beyond its authority for 1 s"
+    assert told[3].endswith("outside its training range for 1 s")
 
 
 def test_controllers_without_a_form_for_arrays(vehicle: Vehicle, design: Design) -> None:
