@@ -4,9 +4,9 @@
     python benchmarks/wrong_models.py FOLDER [--vehicles 1]
 
 Each `FOLDER/vehicle-N` holds what a simulated vehicle has taught. Its model, that times a factor, and constants are
-flown in-process with `corrected`: on a lemniscate at 3 m/s, in wind and with a payload as well, and on fast ones of 40 m
-by 10 m. Told are how the flight ended, the greatest distance from the reference, beside that of `lqr`, and when and why
-the guard gave the model up, in s from the moment from which the model acted wholly.
+flown in-process with `corrected`: on a lemniscate at 3 m/s, also in wind and with a payload, and on fast ones of 40 m.
+Told are how the flight ended, the greatest distance from the reference, beside that of `lqr`, and when and why the
+guard gave the model up, in s from the moment from which the model acted wholly.
 """
 
 from __future__ import annotations
