@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from trueflight.groundstation.live.engine import Engine
+from trueflight.groundstation.live.learnt import Followed, Learnt
 from trueflight.groundstation.live.said import Alert, Said, follow
 from trueflight.groundstation.live.sources import Source
 from trueflight.groundstation.live.window import Window
@@ -43,6 +44,9 @@ class Shown(Protocol):
     def state(self, name: str, silent: float, status: dict[str, Any]) -> None:
         """How long a vehicle has been silent, s (0: it is not), and its companion's status."""
 
+    def learnt(self, name: str, flight: int, news: Sequence[Learnt]) -> None:
+        """What its companion learnt in flight number `flight` and flies with now."""
+
     def said(self, name: str, said: Said, alerts: Sequence[Alert], news: Sequence[Alert], age: float) -> None:
         """What the newest look says, `age` s of flight ago; `news` are those of the `alerts` that are told now."""
 
@@ -58,6 +62,7 @@ class _Watched:
     alerts: tuple[Alert, ...] = ()
     flight: int = 0
     base: Model | None = None
+    followed: Followed = field(default_factory=Followed)
     wrong: str = field(default="")
 
 
@@ -113,6 +118,7 @@ class Watch:
         if ticks:
             w.heard = time.monotonic()
             w.window.take(ticks)
+            learnt = w.followed.take(ticks, w.window.flight, w.window.zero)
             self.seen += len(ticks)
         if filled:
             w.window.fill(filled)
@@ -121,6 +127,8 @@ class Watch:
         for one in self._shown:
             if ticks:
                 one.ticks(name, ticks)
+                if learnt:
+                    one.learnt(name, w.window.flight, learnt)
             if filled:
                 one.past(name, filled)
         for event in w.source.events():

@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from trueflight.groundstation.live.learnt import Learnt
 from trueflight.groundstation.live.said import PERSISTS, Alert, Said
 from trueflight.groundstation.output.as_json import UNIT, effect_found_table, plain
 from trueflight.groundstation.output.tables import SAID, VERDICT_STYLE
@@ -63,6 +64,11 @@ class Lines:
         if bool(silent) != self._silent.get(name, False):
             self._silent[name] = bool(silent)
             self._print(name, "silent" if silent else "heard again", "yellow" if silent else "green")
+
+    def learnt(self, name: str, flight: int, news: Sequence[Learnt]) -> None:
+        """What the companion learnt and flies with."""
+        for one in news:
+            self._print(name, f"{one.time:.0f} s: {one.text}", "green" if one.ended else "bold yellow")
 
     def said(self, name: str, said: Said, alerts: Sequence[Alert], news: Sequence[Alert], age: float) -> None:
         """What has changed since the last look."""
@@ -121,7 +127,7 @@ def _ranked(said: Said) -> list[Any]:
 
 
 class JsonLines:
-    """For a program: one JSON document a line, of the kinds `look`, `alert`, `link`, `filled` and `event`."""
+    """For a program: one JSON document a line, of the kinds `look`, `alert`, `learnt`, `link`, `filled` and `event`."""
 
     def __init__(self, out: Callable[[dict[str, Any]], None] = print_json_line) -> None:
         self._out = out
@@ -154,6 +160,12 @@ class JsonLines:
         if bool(silent) != self._silent.get(name, False):
             self._silent[name] = bool(silent)
             self._out({"kind": "link", "vehicle": name, "silent": bool(silent)})
+
+    def learnt(self, name: str, flight: int, news: Sequence[Learnt]) -> None:
+        """What the companion learnt and flies with."""
+        for one in news:
+            told = {**asdict(one), "text": one.text}
+            self._out(plain({"kind": "learnt", "vehicle": name, "flight": flight, **told}))
 
     def said(self, name: str, said: Said, alerts: Sequence[Alert], news: Sequence[Alert], age: float) -> None:
         """The look, and what it lets be told now."""

@@ -13,6 +13,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from trueflight.groundstation.live.learnt import Learnt
 from trueflight.groundstation.live.said import Alert, Said
 from trueflight.groundstation.views import scene
 from trueflight.groundstation.views.colour import AXES, LINEAR, MEASURED, NEWEST, REFERENCE, WARNING, Colour
@@ -107,6 +108,11 @@ class Views:
         monitor.tell(silent, status)
         panes.grow_old(monitor.now)
 
+    def learnt(self, name: str, flight: int, news: Sequence[Learnt]) -> None:
+        """As in `live.watch.Shown`."""
+        for one in news:
+            self._of[name][0].add_line(one.text, rr.TextLogLevel.INFO if one.ended else rr.TextLogLevel.WARN)
+
     def said(self, name: str, said: Said, alerts: Sequence[Alert], news: Sequence[Alert], age: float) -> None:
         """As in `live.watch.Shown`."""
         monitor, panes = self._of[name]
@@ -185,10 +191,12 @@ class Monitor:
         """Log an event."""
         if self._zero is not None:
             self.stream.set_time(TIME, duration=max(event.vehicle_time_us * 1e-6 - self._zero, 0.0))
-        line = f"{event.kind}: {event.text}"
+        self.add_line(f"{event.kind}: {event.text}", LEVELS.get(event.level))
+
+    def add_line(self, line: str, level: str | None) -> None:
+        """Log a line among the events, at the time that the stream is at."""
         self.stream.log(
-            "events",
-            rr.TextLog(line if not self.root else f"{self.vehicle}: {line}", level=LEVELS.get(event.level)),
+            "events", rr.TextLog(line if not self.root else f"{self.vehicle}: {line}", level=level)
         )
 
     def tell(self, silent: float = 0.0, status: dict[str, Any] | None = None) -> None:
