@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 from json_schemas import SCHEMAS, schema_of, valid
@@ -18,8 +19,10 @@ from typer.testing import CliRunner
 from trueflight.companion.cli import app as companion
 from trueflight.groundstation.commands.app import app as groundstation
 from trueflight.groundstation.commands.reproduce import study_table
+from trueflight.groundstation.output.as_json import over_time_table
 from trueflight.groundstation.reading import read_flight
 from trueflight.groundstation.reading.writing import write_flight
+from trueflight.groundstation.results import DriftingParameter, OverTime
 from trueflight.groundstation.study.reproduce import ARMS, SCENARIOS, Flown, Prepared, Study
 from trueflight.sim_bridge.cli import app as sim_bridge
 
@@ -191,3 +194,10 @@ def test_the_paper_reproduced_as_far_as_its_figures_go() -> None:
     flown = (Flown(1, scenario.name, arm.name, (1e-4, 2e-4, 3e-4), "tripped", "tripped: authority"),)
     study = Study(flown, (Prepared(1, {}, ("rotor_drag",), {"noise floor": 0.05}),))
     valid("groundstation reproduce", {"schema": 1, **study_table(study, [scenario]), "recording": None})
+
+
+def test_what_drifts_in_flight_is_a_document() -> None:
+    times = np.array([0.5, 1.5])
+    drift = DriftingParameter("lift", "1/m", times, times, np.array([np.nan, 0.1]), times)
+    document = json.loads(json.dumps(over_time_table(OverTime(drift=(drift,)))))
+    assert document["drift"]["lift"]["t"] == [0.5, 1.5] and document["drift"]["lift"]["low"] == [None, 0.1]

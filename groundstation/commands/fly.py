@@ -138,7 +138,14 @@ def _accompany(link: Link, mission: str, events: queue.SimpleQueue[Event], quiet
                 f"{status['battery_voltage']:.1f} V, guard {status['guard']}",
             )
 
-        ended = link.end_of(mission, tell)
+        try:
+            ended = link.end_of(mission, tell)
+        except KeyboardInterrupt:
+            Terminal(stderr=True).print(
+                f"{mission} flies on, and its record stays on board; groundstation status tells of it",
+                style="yellow",
+            )
+            raise
         time.sleep(0.2)  # the event that says why is on its way
         _print_events(events, progress.console, quiet)
         return ended

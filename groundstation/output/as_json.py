@@ -282,24 +282,26 @@ def gusts_table(g: Gusts) -> dict[str, Any]:
 
 def over_time_table(o: OverTime) -> dict[str, Any]:
     """The JSON of an effect that changes in flight."""
-    return {
-        "changes": [asdict(c) for c in o.changes],
-        "stretches": [
-            {
-                "start": s.start,
-                "stop": s.stop,
-                "absent": s.absent,
-                "parameters": {p.name: interval_table(p) for p in s.parameters},
-            }
-            for s in o.stretches
-        ],
-        "drift": {
-            d.name: {"unit": d.unit, "t": d.times, "value": d.value, "low": d.low, "high": d.high}
-            for d in o.drift
-        },
-        "ended": o.ended,
-        "text": list(o.lines),
-    }
+    return plain(
+        {
+            "changes": [asdict(c) for c in o.changes],
+            "stretches": [
+                {
+                    "start": s.start,
+                    "stop": s.stop,
+                    "absent": s.absent,
+                    "parameters": {p.name: interval_table(p) for p in s.parameters},
+                }
+                for s in o.stretches
+            ],
+            "drift": {
+                d.name: {"unit": d.unit, "t": d.times, "value": d.value, "low": d.low, "high": d.high}
+                for d in o.drift
+            },
+            "ended": o.ended,
+            "text": list(o.lines),
+        }
+    )
 
 
 def consistency_table(flight: Flight) -> list[dict[str, Any]]:

@@ -19,6 +19,7 @@ from processes import with_parent
 
 from trueflight.companion.telemetry import PIECE, Telemetry, make_event, read_json
 from trueflight.companion.zenoh_session import ZenohSettings, open_session
+from trueflight.groundstation.commands import fly
 from trueflight.groundstation.commands.app import app
 from trueflight.groundstation.operate.link import Link, companions
 from trueflight.groundstation.operate.settings import Settings, load_settings
@@ -347,3 +348,13 @@ def test_a_companion_that_was_started_again_is_followed_and_obeys(endpoint, tmp_
             assert link.request("mission", {"trajectory": "hover"})["accepted"] and len(asked) == 1
         finally:
             second.close()
+
+
+def test_ctrl_c_while_a_flight_is_followed_says_that_it_goes_on(capsys):
+    class Interrupted:
+        def end_of(self, mission, tell):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fly._accompany(Interrupted(), "m3", queue.SimpleQueue(), True)
+    assert "m3 flies on, and its record stays on board; groundstation status" in capsys.readouterr().err
